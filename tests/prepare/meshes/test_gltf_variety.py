@@ -630,8 +630,9 @@ def archive(*names: str) -> bytes:
         ("m.stl", bytes(80) + b"\1\0\0\0" + bytes(50), "STL; it holds one shape"),
         ("m.mp4", b"\0\0\0\x18ftypmp42", "a video; use `dpc prepare video`"),
         ("m.glb", b"<!DOCTYPE HTML><html>", "a web page; download it again"),
-        ("m.glb", b"version https://git-lfs.github.com/spec/v1", "Git LFS; fetch the file itself"),
+        ("m.glb", b"version https://git-lfs.github.com/spec/v1", "Git LFS; `git lfs pull` brings the file itself"),
         ("m.gltf", "{}".encode("utf-16"), "UTF-16; save it as UTF-8"),
+        ("m.glb", b"\0\0\0\x18ftypheic", "a HEIC picture; name a model"),
     ],
 )
 def test_files_of_other_formats_are_told_what_to_do(tmp_path, name, data, words):

@@ -802,3 +802,43 @@ def test_what_is_left_out_is_told_once(tmp_path, capfd, other, pattern):
     chosen = ("--pattern", pattern) if pattern else ()
     assert exit_code("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32", *chosen) == 0
     assert capfd.readouterr().err.count("left out") == 1
+
+
+@pytest.mark.parametrize("beside", ["sparse", "../transforms.json", "../cameras", "0.xmp", "edits.xmp", "../../sparse"])
+def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(tmp_path, capfd, beside):
+    folder = save(tmp_path / "scene" / "images", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (folder / beside).write_text('<x:xmpmeta xcr:Position="1"/>' if beside == "0.xmp" else "<x:xmpmeta/>")
+    open_frames(folder)
+    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is taken to stand still"
+    assert (said in capfd.readouterr().err) == (beside not in ("edits.xmp", "../../sparse"))
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "said"),
+    [
+        ("0.heic", b"\0\0\0\x18ftypheic", "0.heic: a HEIC picture, which is not read; convert it to PNG"),
+        ("0.exr", b"v/1\x01\2", "0.exr: an EXR picture, which is not read"),
+        ("0.dng", b"II*\0", "0.dng: a raw picture of a camera"),
+        ("frame", b"\x89PNG", "frame is an image without the suffix of one"),
+        (".frame", b"\x89PNG", r"ppm\)$"),
+    ],
+)
+def test_a_folder_without_frames_says_what_it_holds(tmp_path, name, start, said):
+    (tmp_path / name).write_bytes(start + bytes(20))
+    with pytest.raises(DataError, match=f"no frames; expected images .*{said}"):
+        open_frames(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["tga", "jp2", "ppm", "jfif"])
+def test_images_of_rarer_suffixes_are_frames(tmp_path, suffix):
+    folder = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    for path in list(folder.iterdir()):
+        image = Image.open(path)
+        (image if suffix in ("tga", "jp2") else image.convert("RGB")).save(
+            path.with_suffix(f".{suffix}"), "JPEG" if suffix == "jfif" else None, quality=95
+        )
+        path.unlink()
+    frames = open_frames(folder)
+    read, written = next(frames.read([0])), disc((20, 24), 8)
+    assert len(frames) == 3 and np.abs(read[24, 20].astype(int) - written[24, 20]).max() <= 6
+    assert (read[0, 0, 3] == 0) == (suffix in ("tga", "jp2"))
