@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
-from dpcli.prepare.decode.mesh_files import load_mesh
+from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
+from dpcli.prepare.meshes.mesh_files import load_mesh
 from dpcli.prepare.reader import natural_key, require_folder
 
 
@@ -47,7 +47,7 @@ def load_shape(path: Path, up: str) -> Shape:
     Raises DataError when it has no surface.
     """
     try:
-        mesh = load_mesh(path, files_inside(path, path.parent))
+        mesh = load_mesh(path, path.parent)
         triangles = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces, np.int64)]
     except DataError:
         raise

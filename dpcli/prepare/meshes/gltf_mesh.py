@@ -9,14 +9,14 @@ import numpy as np
 
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
-from dpcli.prepare.meshes.gltf_draco import decompress
-from dpcli.prepare.meshes.gltf_extensions import instances
+from dpcli.prepare.meshes.gltf_extensions import decompress, instances
 from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
 from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, node_visibility, read_clip
 from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.runtime.progress import log
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_STILL = Clip("still", 0.0, 0.0, {})
 _BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
 _MOST_VERTICES = 20_000_000  # of all instances of a node
@@ -50,14 +50,12 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     Raises DataError when the file is broken.
     """
     parent = node_parents(file)
-    curves = Clip("still", 0.0, 0.0, {}) if clip is None else read_clip(file, clip)
+    curves = _STILL if clip is None else read_clip(file, clip)
     if curves.passed:
         log.warn(f"{file.path}: clip {curves.name!r} also changes what is not read: {', '.join(curves.passed)}")
     time = curves.sample_times(frames)
     poses, shown = node_poses(file, parent, curves, time), node_visibility(file, parent, curves, time)
-    visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
-    pieces = [piece for node in visible for piece in _read_node(file, node)]
-    pieces = [_turned_out(piece, poses) for piece in pieces if len(piece.triangles)]
+    pieces = _visible_pieces(file, poses, shown)
     if not pieces:
         raise file.fail("has no triangles in its scene; expected a mesh with an animation")
     used = sorted({piece.material for piece in pieces})
@@ -103,6 +101,26 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         if culled.any() and turned.any()
         else None,
     )
+
+
+def shape_at_rest(file: Gltf) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices f32 (V,3) and triangles i64 (T,3) of the scene as it stands, without what shows them: no texture is read."""
+    parent, time = node_parents(file), np.zeros(1)
+    poses, shown = node_poses(file, parent, _STILL, time), node_visibility(file, parent, _STILL, time)
+    pieces = _visible_pieces(file, poses, shown)
+    starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
+    moved = [_move(file, piece, _STILL, time, poses)[0][0] for piece in pieces]
+    triangles = [piece.triangles + start for piece, start in zip(pieces, starts)]
+    return np.concatenate([np.zeros((0, 3), np.float32), *moved]), np.concatenate(
+        [np.zeros((0, 3), np.int64), *triangles]
+    )
+
+
+def _visible_pieces(file: Gltf, poses: np.ndarray, shown: np.ndarray) -> list[_Piece]:
+    """Returns the pieces with triangles of the nodes that are seen at some time, bool shown (T,N), their fronts outwards."""
+    visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
+    pieces = [piece for node in visible for piece in _read_node(file, node)]
+    return [_turned_out(piece, poses) for piece in pieces if len(piece.triangles)]
 
 
 def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) -> np.ndarray:

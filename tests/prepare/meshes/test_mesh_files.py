@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.mesh_files import load_mesh, triangles_of
+from dpcli.prepare.meshes.mesh_files import load_mesh, triangles_of
+from tests.support.gltf_files import GlbFile, quad
 
 OUTLINE = np.array([(0, 0), (2, 0), (2, 2), (1, 0.25), (0, 2)])  # a square less a notch: 4 - 1.75
 STAR = np.array([(r * np.cos(a), r * np.sin(a)) for r, a in zip([2, 1] * 6, np.arange(12) * np.pi / 6)])
@@ -79,6 +80,57 @@ def test_collada_is_refused_where_its_reader_would_reach_beyond_a_polygon(tmp_pa
                 load_mesh(path, None)
         else:
             assert load_mesh(path, None).area == pytest.approx(area(STAR[corners]))
+
+
+def quantized(file: GlbFile) -> None:
+    corners = np.zeros((4, 4), np.int16)
+    corners[:, :2] = [[-32767, -32767], [32767, -32767], [32767, 32767], [-32767, 32767]]
+    view = {"bufferView": file.view(corners.tobytes(), byteStride=8), "componentType": 5122, "normalized": True}
+    file.tree["accessors"][0] |= view
+    file.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+
+
+def sparse(file: GlbFile) -> None:
+    where, what = file.view(np.uint16([1, 2]).tobytes()), file.view(np.float32([[3, -1, 0], [3, 1, 0]]).tobytes())
+    indices = {"bufferView": where, "componentType": 5123}
+    file.tree["accessors"][0]["sparse"] = {"count": 2, "indices": indices, "values": {"bufferView": what}}
+
+
+def fan(file: GlbFile) -> None:
+    file.tree["meshes"][0]["primitives"][0] |= {"mode": 6, "indices": file.add([0, 1, 2, 3], "u1")}
+
+
+def instances(file: GlbFile) -> None:
+    places = {"TRANSLATION": file.add([[0, 0, 0], [5, 0, 0], [9.0, 0, 0]])}
+    file.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": places}}
+
+
+def hidden(file: GlbFile) -> None:
+    file.tree["nodes"].append({"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}})
+    file.tree["scenes"][0]["nodes"].append(1)
+
+
+def lost_picture(file: GlbFile) -> None:
+    file.tree |= {"images": [{"uri": "gone.png"}], "textures": [{"source": 0}]}
+    file.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (quantized, 4),
+        (sparse, 8),
+        (fan, 4),
+        (instances, 12),
+        (hidden, 4),
+        (lost_picture, 4),
+        (lambda file: file.tree.pop("scenes"), 4),
+        (lambda file: file.tree["meshes"][0]["primitives"][0].update(mode=1), 0),
+    ],
+)
+def test_gltf_is_read_as_of_a_model(change, expected, tmp_path):
+    change(file := quad())
+    assert load_mesh(file.write(tmp_path / "m.glb"), tmp_path).area == pytest.approx(expected)
 
 
 def test_what_stands_behind_the_last_triangle_of_an_stl_is_no_triangle(tmp_path):

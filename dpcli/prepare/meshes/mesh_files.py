@@ -1,8 +1,9 @@
-"""Mesh files, by trimesh, with what it leaves out or gets wrong: counts in headers, polygons that aren't convex, numbers of
-vertices that count from the end.
+"""Mesh files, by trimesh but for what it leaves out or gets wrong: counts in headers, polygons that aren't convex, numbers
+of vertices that count from the end, most of glTF.
 
 trimesh takes what is there, and nothing at all of a cut STL. It cuts polygons into fans, which reach beyond the outline
-where it turns inwards, and counts negative numbers in an OBJ from the end of the file, not from where they stand.
+where it turns inwards, and counts negative numbers in an OBJ from the end of the file, not from where they stand. Of glTF
+it passes over normalized and sparse numbers, fans, instances, hidden nodes, and scenes that are not there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,11 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import path_inside
 from dpcli.prepare.cloud_formats.ply import read_header
+from dpcli.prepare.meshes.gltf import read_gltf, well_formed
+from dpcli.prepare.meshes.gltf_extensions import refuse_required
+from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
 _ODD_FACE = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n]*[ \t]-|[^\n]*\\)", re.MULTILINE)
@@ -37,8 +43,9 @@ def require_counts(path: Path) -> None:
         check(path)
 
 
-def load_mesh(path: Path, resolver: Any) -> Any:
-    """Returns the trimesh.Trimesh of a file, as it stands in it; resolver: what trimesh asks for the files it names.
+def load_mesh(path: Path, root: Path | None) -> Any:
+    """Returns the trimesh.Trimesh of a file, as it stands in it; root: the folder that files which it names must lie in, None
+    for any.
 
     Raises DataError where its counts are wrong or it has polygons that can't be read, and whatever trimesh does on a damaged one.
     """
@@ -54,17 +61,39 @@ def load_mesh(path: Path, resolver: Any) -> Any:
         if _ODD_FACE.search(data):
             return _mesh_of(_of_obj(data))
         source = {"file_obj": BytesIO(data), "file_type": "obj", "skip_materials": True}
+    if kind in (".glb", ".gltf"):
+        return _of_gltf(path, root)
     if kind == ".stl":
         source = {"file_obj": BytesIO(_whole_triangles(path.read_bytes())), "file_type": "stl"}
     if kind == ".dae":
         _require_convex(path)
     try:
-        mesh = trimesh.load(**source, force="mesh", process=False, resolver=resolver)
+        mesh = trimesh.load(**source, force="mesh", process=False, resolver=_files_inside(path, root))
     except DataError as error:  # of the resolver, which doesn't know who asks
         raise DataError(f"{path} cannot be read ({error})") from None
     if kind in (".ply", ".off") and (polygons := {".ply": _of_ply, ".off": _of_off}[kind](path, len(mesh.faces))):
         return _mesh_of(polygons)
     return mesh
+
+
+def _files_inside(path: Path, root: Path | None) -> Any:
+    """Returns what trimesh asks for the files that a mesh names: those inside ``root`` alone."""
+    from trimesh.resolvers import FilePathResolver
+
+    class _Inside(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            return path_inside(root, path.parent, name.strip()).read_bytes()
+
+    return _Inside(str(path))
+
+
+def _of_gltf(path: Path, root: Path | None) -> Any:
+    from trimesh import Trimesh
+
+    with well_formed(path):
+        file = replace(read_gltf(path), root=root)
+        refuse_required(file)
+        return Trimesh(*shape_at_rest(file), process=False)
 
 
 def _whole_triangles(data: bytes) -> bytes:
@@ -111,8 +140,10 @@ def _of_off(path: Path, triangles: int) -> Polygons | None:
 
 
 def _require_convex(path: Path) -> None:
-    """Raises DataError for a COLLADA file with polygons that aren't convex, which its reader cuts into fans."""
+    """Raises DataError for a COLLADA file that places nothing, or with polygons that aren't convex: its reader cuts fans."""
     data = path.read_bytes()
+    if b"scene>" not in data:
+        raise DataError(f"{path}: it has no scene, so nothing in it is placed; export it again")
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return
