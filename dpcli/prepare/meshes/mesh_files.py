@@ -26,7 +26,11 @@ from dpcli.prepare.meshes.gltf_extensions import refuse_required
 from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
-_ODD_FACE = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n]*[ \t]-|[^\n]*\\)", re.MULTILINE)
+_WORD = rb"[^\s\\-]+[ \t]*"
+# a face of anything but three corners by rising numbers, or one that goes on in the next line
+_ODD_FACE = re.compile(rb"\n[ \t]*f[ \t]+(?!%b(?<=[ \t])%b(?<=[ \t])%b(?:[\r\n#]|\Z))[^\r\n]" % (_WORD, _WORD, _WORD))
+_COMMA = re.compile(rb"\nv[ \t]+-?\d+,\d")
+_BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
 _SOLID = rb"(?i)\s*solid"
@@ -56,7 +60,7 @@ def load_mesh(path: Path, root: Path | None) -> Any:
     source: dict[str, Any] = {"file_obj": path}
     if kind == ".obj":
         data = path.read_bytes().removeprefix(_MARK)
-        if re.search(rb"^v[ \t]+-?\d+,\d", data, re.MULTILINE):
+        if _COMMA.search(b"\n" + data[:_BEGINNING]):
             raise DataError(f"{path}: numbers with decimal commas; export it with points")
         if _ODD_FACE.search(data):
             return _mesh_of(_of_obj(data))
