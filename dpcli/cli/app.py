@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import errno
 import functools
 import math
@@ -18,16 +17,15 @@ from typing import Any
 import typer
 
 from dpcli import __version__
-from dpcli.cli.help_groups import SectionedCommand, SectionedGroup, use_sections
+from dpcli.cli.help_groups import SectionedCommand, SectionedGroup
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
-from dpcli.signal_exit import INTERRUPTED, let_end, set_working, signal_outcome
+from dpcli.signal_exit import INTERRUPTED, end_at_once, let_end, set_working, signal_outcome
 
 tune_environment()  # before torch and numba load
 
-# Options are many and take long to set up: only the room that is asked for is loaded, and of it only the command that is
-# asked for is set up; `dpc --help` loads none.
+# Options are many and take long to set up: only the command that is asked for is loaded; `dpc --help` loads none.
 ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
     "classify": "Recognize actions and gestures (Kinet).",
@@ -77,9 +75,8 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         elif name == "info":
             dpc.command(name, cls=SectionedCommand, help=about)(import_module("dpcli.cli.info").info)
         else:
-            room = import_module(f"dpcli.cli.{name}.app").app
-            use_sections(room)
-            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about, cls=SectionedGroup)
+            room = import_module(f"dpcli.cli.{name}.app").ROOM
+            dpc.add_typer(room.application(path[1:] if path else ()), name=name, help=about)
     return dpc
 
 
@@ -89,26 +86,6 @@ def _words_to_complete() -> list[str] | None:
         return None
     words = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")  # bash; zsh and fish
     return words.split()[1:]
-
-
-def _narrowed(group: typer.Typer, path: Sequence[str]) -> typer.Typer:
-    """The group with only the command that the path begins with, or as it is where that names none.
-
-    Groups have no options of their own, so the first word that is no option is the command's name.
-    """
-    commands = [entry for entry in group.registered_commands if path and _name(entry) == path[0]]
-    groups = [entry for entry in group.registered_groups if path and entry.name == path[0]]
-    if not commands and not groups:
-        return group
-    one = copy.copy(group)
-    one.registered_commands, one.registered_groups = commands, [copy.copy(entry) for entry in groups]
-    for entry in one.registered_groups:
-        entry.typer_instance = _narrowed(entry.typer_instance, path[1:])
-    return one
-
-
-def _name(command: typer.models.CommandInfo) -> str:
-    return command.name or typer.main.get_command_name(command.callback.__name__)
 
 
 def _not_loaded() -> None:
@@ -261,6 +238,7 @@ def main(argv: list[str] | None = None) -> None:
 
         code, said = ended
         log.error(said)
+        end_at_once(code)
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -25,7 +25,7 @@ from tests.fuzz.fuzz_options import is_bug, odd
 
 def paths_of(group: typer.Typer) -> list[tuple[str, ...]]:
     """The words of every command below a group."""
-    own = [(cli._name(command),) for command in group.registered_commands]
+    own = [(command.name,) for command in group.registered_commands]
     below = [(entry.name, *path) for entry in group.registered_groups for path in paths_of(entry.typer_instance)]
     return own + below
 
