@@ -97,8 +97,6 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
         mesh = load_mesh(file, root)
         if mesh.vertices.shape[1:] != (3,):
             raise ValueError(f"its vertices have {mesh.vertices.shape[1]} coordinates, expected 3")
-        if len(mesh.faces) and mesh.faces.max() >= len(mesh.vertices):
-            raise ValueError("a face names a vertex that is not there")
         return mesh
     except DataError as error:
         raise DataError(f"{path}: its mesh {error}") from None

@@ -26,10 +26,11 @@ from dpcli.prepare.meshes.gltf_extensions import refuse_required
 from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
-_WORD = rb"[^\s\\-]+[ \t]*"
-# a face of anything but three corners by rising numbers, or one that goes on in the next line
+_WORD = rb"(?!0)[^\s\\-]+[ \t]*"
+# a face of anything but three corners by numbers from 1, or one that goes on in the next line
 _ODD_FACE = re.compile(rb"\n[ \t]*f[ \t]+(?!%b(?<=[ \t])%b(?<=[ \t])%b(?:[\r\n#]|\Z))[^\r\n]" % (_WORD, _WORD, _WORD))
 _COMMA = re.compile(rb"\nv[ \t]+-?\d+,\d")
+_NO_VERTEX = "a face names a vertex that is not there"
 _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
@@ -53,31 +54,57 @@ def load_mesh(path: Path, root: Path | None) -> Any:
 
     Raises DataError where its counts are wrong or it has polygons that can't be read, and whatever trimesh does on a damaged one.
     """
+    require_counts(path)
+    mesh = _READERS.get(path.suffix.lower(), _by_trimesh)(path, root)
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ValueError(_NO_VERTEX)
+    return mesh
+
+
+def _by_trimesh(path: Path, root: Path | None, **source: Any) -> Any:
+    """Returns what trimesh makes of a file; source: of what else than its path."""
     import trimesh
 
-    require_counts(path)
-    kind = path.suffix.lower()
-    source: dict[str, Any] = {"file_obj": path}
-    if kind == ".obj":
-        data = path.read_bytes().removeprefix(_MARK)
-        if _COMMA.search(b"\n" + data[:_BEGINNING]):
-            raise DataError(f"{path}: numbers with decimal commas; export it with points")
-        if _ODD_FACE.search(data):
-            return _mesh_of(_of_obj(data))
-        source = {"file_obj": BytesIO(data), "file_type": "obj", "skip_materials": True}
-    if kind in (".glb", ".gltf"):
-        return _of_gltf(path, root)
-    if kind == ".stl":
-        source = {"file_obj": BytesIO(_whole_triangles(path.read_bytes())), "file_type": "stl"}
-    if kind == ".dae":
-        _require_convex(path)
+    source = {"file_obj": path} | source
     try:
-        mesh = trimesh.load(**source, force="mesh", process=False, resolver=_files_inside(path, root))
+        return trimesh.load(**source, force="mesh", process=False, resolver=_files_inside(path, root))
     except DataError as error:  # of the resolver, which doesn't know who asks
         raise DataError(f"{path} cannot be read ({error})") from None
-    if kind in (".ply", ".off") and (polygons := {".ply": _of_ply, ".off": _of_off}[kind](path, len(mesh.faces))):
-        return _mesh_of(polygons)
-    return mesh
+
+
+def _read_obj(path: Path, root: Path | None) -> Any:
+    data = path.read_bytes().removeprefix(_MARK)
+    if _COMMA.search(b"\n" + data[:_BEGINNING]):
+        raise DataError(f"{path}: numbers with decimal commas; export it with points")
+    if _ODD_FACE.search(data):
+        return _mesh_of(_of_obj(data))
+    return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="obj", skip_materials=True)
+
+
+def _read_stl(path: Path, root: Path | None) -> Any:
+    return _by_trimesh(path, root, file_obj=BytesIO(_whole_triangles(path.read_bytes())), file_type="stl")
+
+
+def _read_ply(path: Path, root: Path | None) -> Any:
+    with path.open("rb") as file:
+        _, elements = read_header(path, file)
+    faces = sum(element.count for element in elements if element.name == "face")
+    try:
+        mesh = _by_trimesh(path, root)
+    except Exception:  # such as of triangles and squares together
+        return _mesh_of(_of_ply(path))
+    return mesh if len(mesh.faces) == faces else _mesh_of(_of_ply(path))
+
+
+def _read_off(path: Path, root: Path | None) -> Any:
+    counts, rows = _off_rows(path)
+    mesh = _by_trimesh(path, root)
+    return mesh if not rows or len(mesh.faces) == counts[1] else _mesh_of(_of_off(counts[0], rows))
+
+
+def _read_dae(path: Path, root: Path | None) -> Any:
+    _require_convex(path)
+    return _by_trimesh(path, root)
 
 
 def _files_inside(path: Path, root: Path | None) -> Any:
@@ -91,7 +118,7 @@ def _files_inside(path: Path, root: Path | None) -> Any:
     return _Inside(str(path))
 
 
-def _of_gltf(path: Path, root: Path | None) -> Any:
+def _read_gltf(path: Path, root: Path | None) -> Any:
     from trimesh import Trimesh
 
     with well_formed(path):
@@ -118,29 +145,19 @@ def _of_obj(data: bytes) -> Polygons:
     return np.array(points).reshape(len(points), -1), polygons
 
 
-def _of_ply(path: Path, triangles: int) -> Polygons | None:
-    """Returns the polygons of a file whose faces are more than so many triangles; None where they are those."""
+def _of_ply(path: Path) -> Polygons:
     from plyfile import PlyData
 
-    with path.open("rb") as file:
-        _, elements = read_header(path, file)
-    if triangles == next((element.count for element in elements if element.name == "face"), triangles):
-        return None
     held = PlyData.read(path)
     corners = next(one for one in held["face"].properties if one.name in ("vertex_indices", "vertex_index"))
     points = np.stack([held["vertex"][axis] for axis in "xyz"], axis=1).astype(np.float64)
     return points, list(held["face"][corners.name])
 
 
-def _of_off(path: Path, triangles: int) -> Polygons | None:
-    """Returns the polygons as for `_of_ply`."""
-    counts, rows = _off_rows(path)
-    if not rows or counts[1] == triangles:
-        return None
-    vertices, faces = rows[: counts[0]], (row.split() for row in rows[counts[0] :])
-    return np.array([row.split()[:3] for row in vertices], np.float64), [
-        [int(word) for word in words[1 : 1 + int(words[0])]] for words in faces
-    ]
+def _of_off(vertices: int, rows: list[bytes]) -> Polygons:
+    points = np.array([row.split()[:3] for row in rows[:vertices]], np.float64)
+    words = [row.split() for row in rows[vertices:]]
+    return points, [[int(word) for word in own[1 : 1 + int(own[0])]] for own in words]
 
 
 def _require_convex(path: Path) -> None:
@@ -183,7 +200,7 @@ def triangles_of(points: np.ndarray, polygons: Iterable[Sequence[int]]) -> np.nd
     found = [np.zeros((0, 3), np.int64)]
     for size, corners in _by_size(polygons).items():
         if corners.min() < 0 or corners.max() >= len(points):
-            raise ValueError("a face names a vertex that is not there")
+            raise ValueError(_NO_VERTEX)
         convex = _are_convex(points[corners])
         found += [corners[convex][:, [0, k, k + 1]] for k in range(1, size - 1)]
         for own in corners[~convex]:
@@ -284,3 +301,7 @@ def _check_ply(path: Path) -> None:
 
 
 _CHECKS: dict[str, Callable[[Path], None]] = {".off": _check_off, ".stl": _check_stl, ".ply": _check_ply}
+_READERS: dict[str, Callable[[Path, Path | None], Any]] = {
+    **{".obj": _read_obj, ".stl": _read_stl, ".ply": _read_ply, ".off": _read_off, ".dae": _read_dae},
+    **{".glb": _read_gltf, ".gltf": _read_gltf},
+}

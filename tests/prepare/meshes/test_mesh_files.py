@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 
 import numpy as np
 import pytest
@@ -80,6 +81,27 @@ def test_collada_is_refused_where_its_reader_would_reach_beyond_a_polygon(tmp_pa
                 load_mesh(path, None)
         else:
             assert load_mesh(path, None).area == pytest.approx(area(STAR[corners]))
+
+
+def test_triangles_and_squares_together_in_a_binary_ply(tmp_path):
+    """As Blender and MeshLab write them, with coordinates of textures beside the corners."""
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 4\n" + "".join(f"property float {k}\n" for k in "xyz")
+    head += "element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+    rows = struct.pack("<B3iB2f", 3, 0, 1, 2, 2, 0, 1) + struct.pack("<B4iB1f", 4, 0, 1, 2, 3, 1, 0)
+    corners = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    (tmp_path / "m.ply").write_bytes(head.encode() + corners.tobytes() + rows)
+    assert load_mesh(tmp_path / "m.ply", None).area == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("number", [-1, 3])
+@pytest.mark.parametrize("name", ["m.ply", "m.off", "m.obj"])
+def test_numbers_of_no_vertex_are_refused(name, number, tmp_path):
+    """trimesh counts negative ones from the end, and 0 in an OBJ, too."""
+    path = written(tmp_path / name, OUTLINE[:3])
+    old, new = ("3/1", f"{number + 1}/1") if name == "m.obj" else ("3 0 1 2", f"3 0 1 {number}")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises((ValueError, IndexError), match="a vertex that is not there|outside the range|out of bounds"):
+        load_mesh(path, None)
 
 
 def quantized(file: GlbFile) -> None:
