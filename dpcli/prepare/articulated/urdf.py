@@ -15,6 +15,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, drop_degenerate, joint_motion
 from dpcli.prepare.articulated.urdf_meshes import geometry_triangles, resolve
+from dpcli.runtime.clips.other_files import refuse_wrapped
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
@@ -105,6 +106,7 @@ def _parse(path: Path) -> Any:
     logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
     utf8_path(path, "yourdfpy")
     try:
+        refuse_wrapped(path)
         text = path.read_bytes().lstrip(b" \t\r\n")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None

@@ -166,7 +166,12 @@ def _scene_nodes(file: Gltf) -> list[int]:
     """Returns nodes of the default scene, parents first; all nodes when the file names no scene."""
     if not file.items("scenes"):
         return list(range(len(file.items("nodes"))))
-    order = list(dict.fromkeys(file.item("scenes", file.tree.get("scene", 0)).get("nodes", [])))
+    scene = file.item("scenes", number := file.tree.get("scene", 0))
+    if (count := len(file.items("scenes"))) > 1:
+        log.info(
+            f"{file.path}: {count} scenes in it; {number} ({scene.get('name') or 'no name'}) is read, as viewers do"
+        )
+    order = list(dict.fromkeys(scene.get("nodes", [])))
     for index in order:  # grows while it is walked; circles are refused before
         order += file.item("nodes", index).get("children", [])
     return order

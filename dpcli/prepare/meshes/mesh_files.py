@@ -24,6 +24,7 @@ from dpcli.prepare.cloud_formats.ply import read_header
 from dpcli.prepare.meshes.gltf import read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import refuse_required
 from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
+from dpcli.runtime.clips.other_files import refuse_wrapped
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
 _WORD = rb"(?!0)[^\s\\-]+[ \t]*"
@@ -52,8 +53,10 @@ def load_mesh(path: Path, root: Path | None) -> Any:
     """Returns the trimesh.Trimesh of a file, as it stands in it; root: the folder that files which it names must lie in, None
     for any.
 
-    Raises DataError where its counts are wrong or it has polygons that can't be read, and whatever trimesh does on a damaged one.
+    Raises DataError where it is an archive or the like, where its counts are wrong or it has polygons that can't be read, and
+    whatever trimesh does on a damaged one.
     """
+    refuse_wrapped(path)
     require_counts(path)
     mesh = _READERS.get(path.suffix.lower(), _by_trimesh)(path, root)
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):

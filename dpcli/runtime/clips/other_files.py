@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from dpcli.errors import DataError
+
 _KINDS = (  # what a file is, what it is treated like, and what then comes where in it
     ("a zip archive", "archive", 0, b"PK\x03\x04"),
     ("a 7z archive", "archive", 0, b"7z\xbc\xaf\x27\x1c"),
@@ -18,6 +20,7 @@ _KINDS = (  # what a file is, what it is treated like, and what then comes where
     ("a Photoshop picture", "picture", 0, b"8BPS"),
     ("an EXR picture", "picture", 0, b"v/1\x01"),
     ("a raw picture of a camera, or a TIFF", "picture", 0, b"II*\0", b"MM\0*"),
+    ("a piece of a streamed video", "piece", 4, b"styp", b"moof", b"sidx"),
     ("an array of NumPy", "arrays", 0, b"\x93NUMPY"),
     ("HDF5 (Alembic, or a file that dpc made)", "arrays", 0, b"\x89HDF"),
     ("a glTF model", "gltf", 0, b"glTF"),
@@ -44,12 +47,14 @@ PAGE = "download it again"
 POINTER = "`git lfs pull` brings the file itself"
 _MODEL = "for a clip of a model, export glTF 2.0, which `dpc prepare animation` reads"
 _DRAW = "where it holds annotations, draw their masks into a folder as PNG, or export a Lottie animation as WebM"
+_WRAPPED = {"pointer": POINTER, "archive": "unpack it first", "packed": "unpack it first"}
 _FOR_CLIPS = {
     **{"archive": "unpack it first", "packed": "unpack it first, or export it again (a sticker: as WebM)"},
     **{"picture": "which is not read; convert it to PNG", "arrays": "write its pictures into a folder as PNG"},
     **dict.fromkeys(("model", "motion", "program", "tile", "shape"), _MODEL),
     **{"gltf": "which `dpc prepare animation` reads", "playlist": "name the video that it plays", "json": _DRAW},
     **{"pointer": POINTER, "page": PAGE, "wide": "name a video"},
+    "piece": "put its beginning before it: cat init.mp4 PIECE ... > clip.mp4",
 }
 
 
@@ -64,6 +69,13 @@ def what_it_is(start: bytes, advice: Mapping[str, str]) -> str:
         if found and alike in advice:
             return f"{what}{', ' if advice[alike].startswith('which') else '; '}{advice[alike]}"
     return ""
+
+
+def refuse_wrapped(path: Path) -> None:
+    """Raises DataError for an archive, or a pointer of Git LFS, in the place of a file of any kind."""
+    with open(path, "rb") as file:
+        if what := what_it_is(file.read(_START), _WRAPPED):
+            raise DataError(f"{path}: {what}")
 
 
 def no_video(path: Path) -> str:

@@ -130,6 +130,14 @@ def test_a_mirrored_node_keeps_its_front(tmp_path):
     assert look(load(file, tmp_path))[32, 32, 3] == 0
 
 
+def test_of_several_scenes_the_one_that_viewers_show_is_read_and_told(tmp_path, capsys):
+    file = quad()
+    index = node(file, mesh=square(file, 5.0))
+    file.tree |= {"scenes": [{"nodes": [0]}, {"nodes": [index], "name": "take 2"}], "scene": 1}
+    assert load(file, tmp_path).positions[..., 0].min() == 4
+    assert "2 scenes in it; 1 (take 2) is read, as viewers do" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("scales", [(1, -1), (-1, 0.5), (-0.5, 1)])
 def test_a_front_is_in_front_in_every_frame_of_a_clip_that_mirrors_it(scales, tmp_path):
     """As flat figures turn round, by a scale that jumps below 0; a scene names its root twice, too."""

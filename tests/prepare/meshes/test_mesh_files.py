@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
+from dpcli.prepare.articulated.urdf import read_skeleton
 from dpcli.prepare.meshes.mesh_files import load_mesh, triangles_of
 from tests.support.gltf_files import GlbFile, quad
 
@@ -184,3 +185,11 @@ def test_what_is_not_read_of_a_mesh_is_named(name, text, said, tmp_path):
     (tmp_path / name).write_text(text)
     with pytest.raises(DataError, match=f"{name}: .*{said}.*; export it"):
         load_mesh(tmp_path / name, None)
+
+
+@pytest.mark.parametrize("name", ["m.obj", "m.stl", "m.dae", "m.ply", "m.glb", "r.urdf"])
+def test_a_pointer_in_the_place_of_a_file_is_named(name, tmp_path):
+    """As a repository is cloned without Git LFS; an OBJ would be a mesh without faces."""
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 132\n")
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
+        read_skeleton(tmp_path / name) if name == "r.urdf" else load_mesh(tmp_path / name, None)

@@ -363,6 +363,7 @@ def test_a_pattern_that_chooses_nothing_is_told(pictures, tmp_path):
         (b"Kaydara FBX Binary  \0", "FBX; for a clip of a model, export glTF 2.0"),
         (b"\0\0\0\x18ftypheic", "a HEIC picture, which is not read; convert it"),
         (b"\x93NUMPY\1\0", "an array of NumPy"),
+        (b"\0\0\0\x18stypmsdh", "a piece of a streamed video; put its beginning before it"),
         (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
         (b"<!DOCTYPE html>", "a web page; download it again"),
         (b'\xef\xbb\xbf{"annotations": []}', "JSON; where it holds annotations, draw their masks"),
