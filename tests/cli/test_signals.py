@@ -250,6 +250,31 @@ def test_who_reads_a_pipe_does_not_wait_for_the_one_that_stands_by():
     assert process.returncode == 0
 
 
+DROPPED = """
+import os, signal, time
+from dpcli import signal_exit as s
+s._AGAIN = 0.5
+s.watch_signals()
+s.set_working(True)
+try:
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)
+    except BaseException:  # as C code that takes any exception for "it is not there"
+        pass
+    time.sleep(50)
+finally:
+    for _ in range(20):
+        time.sleep(0.1)
+    os.write(1, b"tidied")
+"""
+
+
+def test_what_ends_a_command_is_raised_again_where_a_library_drops_it_but_not_while_it_tidies_up():
+    done = subprocess.run([sys.executable, "-c", DROPPED], cwd=ROOT, capture_output=True, timeout=40)
+    assert done.stdout == b"tidied" and done.stderr.count(b"signal_exit.Ended") == 1, done.stderr
+
+
 AS_A_WORKER_STARTS = """
 import os, signal, sys
 from multiprocessing.process import BaseProcess
