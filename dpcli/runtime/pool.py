@@ -137,14 +137,17 @@ class _Pool:
             return self._try_alone(item)
 
     def _try_alone(self, item: Any) -> Any:
-        strangers = set(multiprocessing.active_children())
-        with _new_pool(1) as alone:
+        alone, children = _new_pool(1), []
+        try:
             tried = alone.submit(self._guarded, item)
-            children = set(multiprocessing.active_children()) - strangers
-            try:
-                return _awaited(tried, alone, children)
-            except BrokenProcessPool:
-                return _lost(_end(children))
+            children = list(alone._processes.values())  # type: ignore[attr-defined]  # the public way asks how they ended
+            return _awaited(tried, alone, set(children))
+        except BrokenProcessPool:
+            _end(children)
+            alone.shutdown()  # waits for its thread, which asks how they ended: of two that ask, the second learns nothing
+            return _lost(_signal_of(children))
+        finally:
+            alone.shutdown()
 
     def _end_broken(self) -> None:
         _end(set(multiprocessing.active_children()) - self._strangers)
@@ -170,7 +173,7 @@ def _awaited(future: Future, executor: Executor, children: set) -> Any:
         try:
             return future.result(_LOOK if children else None)
         except NotYet:
-            dead = any(not child.is_alive() for child in children)
+            dead = bool(wait([child.sentinel for child in children], 0))  # doesn't ask how one ended
             if dead and dead_before and not future.done():
                 _end(children)
                 executor._result_queue._writer.close()  # type: ignore[attr-defined]  # nothing public ends that thread
@@ -178,14 +181,15 @@ def _awaited(future: Future, executor: Executor, children: set) -> Any:
             dead_before = dead
 
 
-def _end(children: set) -> str:
-    """Ends the processes of a broken executor, and returns the name of the signal that broke it, "" where nobody can say.
-
-    The executor sends them SIGTERM, which they ignore, and would wait for them for ever.
-    """
-    codes = [child.exitcode for child in children if not child.is_alive()]
+def _end(children: Iterable) -> None:
+    """Ends the processes of a broken executor, which sends them SIGTERM, which they ignore, and would wait for them for ever."""
     for child in children:
         child.kill()
+
+
+def _signal_of(children: list) -> str:
+    """Returns the name of the signal that ended one of some processes, "" where none did or nobody can say."""
+    codes = [child.exitcode for child in children]
     return next((signal.Signals(-code).name for code in codes if code and code < 0), "")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import time
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,3 +76,19 @@ def test_larger_files_may_take_longer(tmp_path):
     (tmp_path / "a" / "gone").symlink_to("nowhere")
     assert _megabytes(tmp_path / "a") == pytest.approx(0.003, abs=1e-4)
     assert _megabytes(tmp_path / "none") == _megabytes(Path("a\0")) == 0
+
+
+def test_how_a_process_ended_is_read_by_one_thread(tmp_path, monkeypatch):
+    """The pipe that holds it can be read once: a second reader at the same time takes it for the code 255."""
+    from multiprocessing import forkserver
+
+    read = forkserver.read_signed
+
+    def slowly(pipe):
+        time.sleep(0.2)
+        return read(pipe)
+
+    monkeypatch.setattr(forkserver, "read_signed", slowly)
+    reader = Deadly(count=2, raw=tmp_path)
+    report = convert(reader, tmp_path / "o.h5", Conversion(jobs=1, item_seconds=5))
+    assert "by SIGSEGV" in report.skipped[0][1]
