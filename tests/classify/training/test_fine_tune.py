@@ -111,6 +111,8 @@ def test_only_what_learns_changes_and_batch_norms_of_the_rest_stay(part, stage, 
     step(torch.randn(4, 2, 32, 3) * 0.2, torch.tensor([0, 1, 2, 0]), 0.01)
     changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
     stream = "static" if stage == 0 else "dynamic"
+    slowest = min(group["share"] for group in step.optimizer.param_groups)
+    assert slowest == (0.1 if part == "all" else 1.0)  # a head alone has few steps, and its last layer is new
     start = {"probe": f"{stream}.head.classify", "head": f"{stream}.head", "all": stream}[part]
     assert changed and all(name.startswith(start) for name in changed)
     assert f"{stream}.head.classify.weight" in changed
