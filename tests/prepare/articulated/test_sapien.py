@@ -199,7 +199,9 @@ def test_meshes_that_cannot_be_used(tmp_path):
         load(with_mesh("a.xyz", "1 2 3"))
     with pytest.raises(DataError, match="its mesh .*bad.glb: not a glTF file"):
         load(with_mesh("bad.glb", "nonsense"))
-    assert load(with_mesh("bad.stl", "nonsense")).notes["mesh files without faces"] == 1
+    with pytest.raises(DataError, match="its mesh .*bad.stl: truncated: its header alone has 84 bytes, it holds 8"):
+        load(with_mesh("bad.stl", "nonsense"))
+    assert load(with_mesh("empty.stl", "solid a\nendsolid a\n")).notes["mesh files without faces"] == 1
     flat = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
     obj = load(with_mesh("flat.obj", flat))
     assert obj.notes["triangles without area dropped"] == 1 and obj.body_areas[0] == 0

@@ -164,7 +164,7 @@ def test_what_stands_behind_the_last_triangle_of_an_stl_is_no_triangle(tmp_path)
     whole = path.read_bytes()
     path.write_bytes(whole + b"\r\n")
     assert load_mesh(path, None).area == pytest.approx(22)
-    for data in (whole + b"\0" * 50, whole[:-1]):
+    for data in (whole + b"\1" * 50, whole[:-1]):
         path.write_bytes(data)
         with pytest.raises(DataError, match="m.stl: (truncated|damaged): its header counts 12 triangles"):
             load_mesh(path, None)
