@@ -112,3 +112,16 @@ def test_types_of_times_are_times_whatever_their_columns_are_called(tmp_path, ki
     assert sequence.time is None if kind == "int64" else sequence.time.tolist() == [0, 2]
     (item,) = TableSequences(tmp_path / "a.parquet", frame_column="recorded", sequence_column="run").items()
     assert "a row has nothing in its column 'run'" in item.problem
+
+
+def test_structures_are_columns_and_lists_are_named(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    places = [{"x": float(k), "y": 1.0, "z": 2.0} for k in range(3)]
+    parquet.write_table(pyarrow.table({"frame": [0, 0, 1], "position": places}), tmp_path / "a.parquet")
+    assert only_sequence(tmp_path / "a.parquet")[0].points[:, 0].tolist() == [0, 1, 2]
+    lists = {name: [[1.0, 2.0], [3.0]] for name in "xyz"}
+    parquet.write_table(pyarrow.table({"frame": [0, 1], **lists}), tmp_path / "b.parquet")
+    (item,) = TableSequences(tmp_path / "b.parquet").items()
+    assert "column 'x' holds lists; expected a row for each point" in item.problem
