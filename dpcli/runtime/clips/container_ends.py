@@ -12,6 +12,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+# Files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened.
+VIDEO_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
+    "dv,mxf,nut,apng,mjpeg,swf,rm"
+)
 _SEGMENT = b"\x18\x53\x80\x67"  # of Matroska and WebM: all but the header
 _NUT_INDEX = bytes.fromhex("4e58dd672f23e64e")
 _ASF_HEAD, _ASF_FILE = bytes.fromhex("3026b2758e66cf11"), bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
