@@ -25,6 +25,7 @@ from dpcli.prepare.meshes.gltf import read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import refuse_required
 from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
 from dpcli.runtime.clips.other_files import refuse_wrapped
+from dpcli.runtime.progress import log
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
 _WORD = rb"(?!0)[^\s\\-]+[ \t]*"
@@ -36,6 +37,7 @@ _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
 _SOLID = rb"(?i)\s*solid"
+_SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
 
 
@@ -85,7 +87,8 @@ def _read_obj(path: Path, root: Path | None) -> Any:
 
 
 def _read_stl(path: Path, root: Path | None) -> Any:
-    return _by_trimesh(path, root, file_obj=BytesIO(_whole_triangles(path.read_bytes())), file_type="stl")
+    data = path.read_bytes()
+    return _by_trimesh(path, root, file_obj=BytesIO(data[: _end_of_stl(data) or None]), file_type="stl")
 
 
 def _read_ply(path: Path, root: Path | None) -> Any:
@@ -130,10 +133,17 @@ def _read_gltf(path: Path, root: Path | None) -> Any:
         return Trimesh(*shape_at_rest(file), process=False)
 
 
-def _whole_triangles(data: bytes) -> bytes:
-    """Returns a binary STL without the few bytes behind its last triangle that some programs write there."""
+def _is_binary(data: bytes) -> bool:
+    return len(data) >= _STL_HEAD and (not re.match(_SOLID, data) or b"\0" in data)
+
+
+def _end_of_stl(data: bytes) -> int:
+    """Returns where the triangles of a binary STL end, if something lies behind that is no triangle: zeros, or bytes that
+    make no whole number of them; else 0. Whole triangles behind are a count that is wrong.
+    """
     end = _STL_HEAD + int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little") * _STL_FACE
-    return data[:end] if end < len(data) < end + _STL_FACE else data
+    behind = data[end:] if _is_binary(data) else b""
+    return end if _STL_HEAD < end and behind and (len(behind) % _STL_FACE or not any(behind)) else 0
 
 
 def _of_obj(data: bytes) -> Polygons:
@@ -283,12 +293,20 @@ def _check_off(path: Path) -> None:
 def _check_stl(path: Path) -> None:
     data = path.read_bytes()
     count = int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little")
-    if not data or 0 <= len(data) - _STL_HEAD - count * _STL_FACE < _STL_FACE:
+    if len(data) in (0, _STL_HEAD + count * _STL_FACE):
         return
-    if len(data) >= _STL_HEAD and (not re.match(_SOLID, data) or b"\0" in data):
+    if end := _end_of_stl(data):
+        with log.each_once(_SAID):
+            log.warn(f"{path}: {len(data) - end} bytes behind its {count} triangles were passed over")
+    elif _is_binary(data):
         _compare(path, "triangles", count, (len(data) - _STL_HEAD) // _STL_FACE)
+        _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))
     elif re.match(_SOLID, data) and not re.search(rb"(?i)\bendsolid\b[^\n]*\s*\Z", data):
         raise DataError(f"{path}: truncated: it doesn't end with endsolid; copy it again")
+    elif not re.match(_SOLID, data):
+        raise DataError(
+            f"{path}: truncated: its header alone has {_STL_HEAD} bytes, it holds {len(data)}; copy it again"
+        )
 
 
 def _check_ply(path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.container_ends import VIDEO_FORMATS, empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.cropping import Margins, entry_box, margins
 from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix, more_than_a_picture
 from dpcli.runtime.clips.other_files import no_video
@@ -27,12 +27,6 @@ from dpcli.runtime.progress import log
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg"),
     *(".wmv", ".flv", ".ogv", ".3gp", ".y4m", ".asf", ".mxf", ".vob", ".dv", ".mjpg", ".mjpeg"),
-)
-# Formats of playlists aren't among them: they name other files, which nobody meant to be read.
-# files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
-VIDEO_FORMATS = (
-    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
-    "dv,mxf,nut,apng,mjpeg,swf,rm"
 )
 _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
@@ -184,9 +178,7 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     context.thread_type = "AUTO"
     context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
-    # A packet without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
-    packets = (packet for packet in container.demux(stream) if packet.size)
-    for packet in chain(packets, [None]):
+    for packet in chain(_packets_with_bytes(path, container, stream), [None]):
         try:
             frames = context.decode(packet)
         except av.FFmpegError as error:
@@ -196,6 +188,19 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
         for frame in frames:
             begun = True
             yield frame
+
+
+def _packets_with_bytes(path: Path, container, stream) -> Iterator:  # of av.Packet
+    """Yields the packets of a stream. DataError where what lies between two of them is damaged.
+
+    One without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
+    """
+    import av
+
+    try:
+        yield from (packet for packet in container.demux(stream) if packet.size)
+    except av.FFmpegError as error:
+        raise DataError(f"{path}: no frame begins where one should ({error.strerror}); copy the video again") from None
 
 
 def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
