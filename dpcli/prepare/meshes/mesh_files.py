@@ -176,7 +176,7 @@ def _of_off(vertices: int, rows: list[bytes]) -> Polygons:
 def _check_collada(path: Path) -> None:
     """Raises DataError for a COLLADA file of which its reader would leave something out, or cut polygons that aren't convex."""
     data = path.read_bytes()
-    if b"scene>" not in data:
+    if not re.search(rb"<(\w+:)?scene\b", data):
         raise DataError(f"{path}: it has no scene, so nothing in it is placed; export it again")
     if b"instance_controller" in data:
         raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
