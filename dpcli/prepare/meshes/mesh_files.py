@@ -95,6 +95,10 @@ def _read_ply(path: Path, root: Path | None) -> Any:
     with path.open("rb") as file:
         _, elements = read_header(path, file)
     faces = sum(element.count for element in elements if element.name == "face")
+    if faces > (size := path.stat().st_size):
+        raise DataError(
+            f"{path}: truncated: its header counts {faces} faces, {size} bytes can't hold them; copy it again"
+        )
     try:
         mesh = _by_trimesh(path, root)
     except Exception:  # such as of triangles and squares together

@@ -10,6 +10,7 @@ Matrix = tuple[
     int, int, int, int
 ]  # a, b, c, d: what is stored at (x, y) from the middle is shown at (ax + cy, bx + dy)
 _BESIDE = {1: "side by side", 2: "one above the other", 4: "pixel by pixel", 5: "side by side", 6: "line by line"}
+_BESIDE |= {7: "column by column"}
 _FLAT = 4  # a projection that is none
 _NEWER = 16  # kinds of what stands beside frames that FFmpeg may know and PyAV not
 _KINDS = ("DISPLAYMATRIX", "STEREO3D", "SPHERICAL")

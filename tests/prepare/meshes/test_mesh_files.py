@@ -92,6 +92,10 @@ def test_triangles_and_squares_together_in_a_binary_ply(tmp_path):
     corners = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     (tmp_path / "m.ply").write_bytes(head.encode() + corners.tobytes() + rows)
     assert load_mesh(tmp_path / "m.ply", None).area == pytest.approx(1.5)
+    damaged = head.replace("face 2", "face 2000000000").encode() + corners.tobytes() + rows
+    (tmp_path / "m.ply").write_bytes(damaged)
+    with pytest.raises(DataError, match="counts 2000000000 faces, [0-9]+ bytes can't hold them"):
+        load_mesh(tmp_path / "m.ply", None)
 
 
 @pytest.mark.parametrize("number", [-1, 3])
