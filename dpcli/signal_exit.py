@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # as in typing, whose import would take longer than all of th
 
 STOPPED, INTERRUPTED = 75, 130  # as EX_TEMPFAIL, and as a shell reports SIGINT
 _RETRY = 0.05  # seconds until it is looked again whether an import still runs
+_AGAIN = 1.0  # seconds until it is looked whether the command is ending or a library dropped what should end it
 _GRACE, _SECOND_GRACE = (
     15,
     2,
@@ -134,6 +135,22 @@ def signal_outcome() -> tuple[int, str] | None:
     return code, "interrupted" if code == INTERRUPTED else stopped
 
 
+def end_at_once(code: int) -> None:
+    """Ends this process when a signal has unwound its command: no thread or library that the signal found at work is waited for.
+
+    Else does nothing.
+    """
+    if not _state.name or _state.process != os.getpid():
+        return
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # nobody reads it any more
+            pass
+    acknowledge_signal()
+    os._exit(code)
+
+
 def let_end() -> None:
     """Ignores further signals: the work is done, and what it is worth is decided."""
     if _state.process == os.getpid():
@@ -162,21 +179,36 @@ def _unwind(number: int, frame: FrameType | None) -> None:
     """Raises Ended, but not within an import: a library that is half there turns it into anything, an abort even.
 
     Nor while a pool starts a worker: one that it doesn't know of yet takes the word to end that another one waits for.
+    It is raised again where a library's C code caught and dropped it, but not in what tidies up because of it.
     """
-    if not _must_be_whole(frame):
+    if _is_unwinding():
+        _unwind_in(_AGAIN)
+    elif _must_be_whole(frame):
+        _unwind_in(_RETRY)
+    else:
+        _unwind_in(_AGAIN)
         raise Ended
-    _retry_unwinding()
 
 
-def _retry_unwinding() -> None:
+def _unwind_in(seconds: float) -> None:
+    if not hasattr(signal, "setitimer"):  # Windows
+        raise Ended
     signal.signal(signal.SIGALRM, _unwind)
-    signal.setitimer(signal.ITIMER_REAL, _RETRY)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def _is_unwinding() -> bool:
+    """Returns whether an exception is being handled that is Ended, or that was raised while Ended was handled."""
+    error = sys.exc_info()[1]
+    while error is not None and not isinstance(error, Ended):
+        error = error.__context__
+    return error is not None
 
 
 def _reraise_dropped(dropped: SimpleNamespace) -> None:
     """Raises Ended again where Python drops errors, such as in what runs as an object goes; others only --debug shows."""
     if dropped.exc_type is Ended:
-        _retry_unwinding()
+        _unwind_in(_RETRY)
     elif "--debug" in sys.argv:
         sys.__unraisablehook__(dropped)
 

@@ -16,8 +16,7 @@ LABELS = "Labels and splits"
 class SectionedGroup(TyperGroup):
     """A group whose help prints its commands in sections, with descriptions that wrap instead of being cut.
 
-    The heading of a command is its ``rich_help_panel``; without one it stands under "Commands". Use it as
-    ``typer.Typer(cls=SectionedGroup)``.
+    The heading of a command is its ``rich_help_panel``; without one it stands under "Commands".
     """
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -47,14 +46,6 @@ class SectionedCommand(TyperCommand):
                 rows.append((_heading(one, _OTHER_OPTIONS if one.param_type_name == "option" else "Arguments"), record))
         places = {"Arguments": 0, _OTHER_OPTIONS: 1, RUNNING: 3}  # all others between, as they come
         _write_sections(sorted(rows, key=lambda row: places.get(row[0], 2)), formatter)
-
-
-def use_sections(app: Any) -> None:
-    """Gives all commands of a typer application, and of the groups in it, a help in sections."""
-    for command in app.registered_commands:
-        command.cls = SectionedCommand
-    for group in app.registered_groups:
-        use_sections(group.typer_instance)
 
 
 def _heading(command_or_option: Any, default: str) -> str:

@@ -55,7 +55,7 @@ def start(folder: Path, words: list[str], **options: object) -> subprocess.Popen
     process = subprocess.Popen(
         [sys.executable, "-c", STARTED, *words],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONFAULTHANDLER": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
@@ -63,6 +63,21 @@ def start(folder: Path, words: list[str], **options: object) -> subprocess.Popen
     )
     assert process.stdout.read(1) == b"x"
     return process
+
+
+def what_it_said(process: subprocess.Popen) -> str:
+    """Returns the errors of a process that ends; of one that doesn't, where its threads stand fails the test."""
+    try:
+        return process.communicate(timeout=120)[1].decode()
+    except subprocess.TimeoutExpired:
+        state = Path(f"/proc/{process.pid}/stat")
+        seen = state.read_text() if state.exists() else "no /proc"
+        process.send_signal(signal.SIGABRT)  # Python's fault handler writes the threads' stacks
+        try:
+            said = process.communicate(timeout=10)[1].decode()
+        except subprocess.TimeoutExpired as other:
+            said = f"another process holds its pipes: {(other.stderr or b'').decode()}"
+        pytest.fail(f"it did not end: {seen}\n{said}")
 
 
 @pytest.mark.parametrize(
@@ -76,8 +91,7 @@ def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):
         process = start(folder, COMMANDS[command])
         time.sleep(wait)
         process.send_signal(number)
-        _, told = process.communicate(timeout=120)
-        said = told.decode()
+        said = what_it_said(process)
         assert "Traceback" not in said and "Exception" not in said and "a bug" not in said, said
         if process.returncode == 0:
             continue  # it was done before
@@ -86,6 +100,25 @@ def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):
         assert SAID[number] in said and said.count("dpc: error:") == 1, (wait, said)
         assert not (folder / "o.h5").exists()
     assert ended >= 2
+
+
+def test_a_stopped_command_waits_for_no_thread(folder):
+    """Nor for a library's, which may never come back from what the signal broke off."""
+    code = """
+import os, signal, threading, time
+import dpcli.cli.app as app
+from dpcli.__main__ import main
+threading.Thread(target=time.sleep, args=(90,)).start()
+set_working = app.set_working
+def stopped(working):
+    set_working(working)
+    os.kill(os.getpid(), signal.SIGTERM)
+app.set_working = stopped
+main()
+"""
+    words, env = [sys.executable, "-c", code, *COMMANDS["info"]], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=folder, env=env, capture_output=True, timeout=60)
+    assert done.returncode == 75 and b"stopped by SIGTERM" in done.stderr
 
 
 def test_what_a_command_keeps_in_tmpdir_goes_with_it(folder):
@@ -162,7 +195,8 @@ def test_a_second_signal_ends_it_at_once(folder):
 DEAF = """
 import itertools, os, signal, sys
 from dpcli import signal_exit as s
-s._DEAF = 0.3
+if sys.argv[1] == "loops":
+    s._GRACE = 0.3
 s.watch_signals()
 s.start_watchdog()
 s.set_working(True)
@@ -214,6 +248,31 @@ def test_who_reads_a_pipe_does_not_wait_for_the_one_that_stands_by():
     assert process.poll() is None
     process.communicate(timeout=30)
     assert process.returncode == 0
+
+
+DROPPED = """
+import os, signal, time
+from dpcli import signal_exit as s
+s._AGAIN = 0.5
+s.watch_signals()
+s.set_working(True)
+try:
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)
+    except BaseException:  # as C code that takes any exception for "it is not there"
+        pass
+    time.sleep(50)
+finally:
+    for _ in range(20):
+        time.sleep(0.1)
+    os.write(1, b"tidied")
+"""
+
+
+def test_what_ends_a_command_is_raised_again_where_a_library_drops_it_but_not_while_it_tidies_up():
+    done = subprocess.run([sys.executable, "-c", DROPPED], cwd=ROOT, capture_output=True, timeout=40)
+    assert done.stdout == b"tidied" and done.stderr.count(b"signal_exit.Ended") == 1, done.stderr
 
 
 AS_A_WORKER_STARTS = """

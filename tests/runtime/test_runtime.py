@@ -121,16 +121,17 @@ def test_a_second_signal_exits_at_once():
 import time
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.weights import load_weights, save_weights
-with stop_requested():
+with stop_requested() as stop:
     print("ready", flush=True)
-    time.sleep(60)
+    while not stop.requested:
+        time.sleep(0.01)
+    print("stopped", flush=True)
     time.sleep(60)
 """
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    process.stdout.readline()
     for _ in range(2):
+        process.stdout.readline()
         process.send_signal(signal.SIGTERM)
-        time.sleep(0.3)
     assert process.wait(timeout=60) == 75
 
 

@@ -88,10 +88,10 @@ def test_a_shape_that_the_file_cannot_hold_is_refused_at_once(clouds, shape):
     with h5py.File(clouds, "a") as file:
         del file["points"]
         file.create_dataset("points", shape, np.float32, chunks=(64, 3)[: len(shape)], compression="gzip")
-    begun = time.monotonic()
+    begun = time.process_time()
     with pytest.raises(DataError, match="claims .* can't hold them"):
         _read_all(clouds)
-    assert time.monotonic() - begun < 1
+    assert time.process_time() - begun < 1
 
 
 def _twice_each(file):

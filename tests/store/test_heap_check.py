@@ -140,9 +140,9 @@ def test_a_good_file_pays_milliseconds(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["points"] = np.random.default_rng(0).random((2 << 20, 4))
     check_heaps(tmp_path / "a.h5")
-    started = time.perf_counter()
+    started = time.process_time()
     check_heaps(tmp_path / "a.h5")
-    assert time.perf_counter() - started < 0.3
+    assert time.process_time() - started < 0.3
 
 
 def test_scores_with_many_names_pass(tmp_path):

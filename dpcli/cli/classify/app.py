@@ -1,17 +1,12 @@
-"""`dpc classify`: gathers its commands."""
+"""`dpc classify`: lists its commands."""
 
 from __future__ import annotations
 
-import typer
+from dpcli.cli.command_table import Group
 
-from dpcli.cli.classify.baseline import baseline
-from dpcli.cli.classify.explain import app as explain
-from dpcli.cli.classify.fuse import fuse
-from dpcli.cli.classify.predict import predict
-from dpcli.cli.classify.profile import profile
-from dpcli.cli.classify.train import train
-
-app = typer.Typer(no_args_is_help=True)
-for command in (train, predict, baseline, fuse, profile):
-    app.command()(command)
-app.add_typer(explain, name="explain")
+EXPLAIN = Group(
+    "dpcli.cli.classify",
+    {"": ("explain:pac", "explain:tsne")},
+    about="Look into a model: activations of points (pac), maps of videos (tsne).",
+)
+ROOM = Group("dpcli.cli.classify", {"": ("train", "predict", "baseline", "fuse", "profile")}, {"explain": EXPLAIN})

@@ -10,20 +10,12 @@ import typer
 
 from dpcli.classify.explain.pac_settings import PAC
 from dpcli.cli.classify.options import Data, Model, Split, Stream
-from dpcli.cli.help_groups import SectionedGroup
 from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.cli.settings_options import options_of
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 
-app = typer.Typer(
-    cls=SectionedGroup,
-    no_args_is_help=True,
-    help="Look into a model: activations of points (pac), maps of videos (tsne).",
-)
 
-
-@app.command()
 @options_of(PAC)
 def pac(
     data: Data,
@@ -62,7 +54,6 @@ def pac(
         typer.echo(f"{output}: activations of {done.points:,} points in {done.clips} clips of {done.frames} frames")
 
 
-@app.command()
 def tsne(
     data: Data,
     model: Model,

@@ -9,14 +9,7 @@ import typer
 
 from dpcli.cli.evaluate.options import FormOptions
 from dpcli.cli.evaluate.output import print_result
-from dpcli.cli.help_groups import SectionedGroup
 from dpcli.cli.options import Json
-
-app = typer.Typer(
-    cls=SectionedGroup,
-    no_args_is_help=True,
-    help="List, check and fetch the weights of the networks that learned metrics need.",
-)
 
 Folder = Annotated[
     Path | None,
@@ -25,7 +18,6 @@ Folder = Annotated[
 Names = Annotated[list[str] | None, typer.Argument(help="Names from `dpc evaluate weights list`.")]
 
 
-@app.command("list")
 def list_command(weights: Folder = None, as_object: Json = False) -> None:
     """List the weights: what they are for, under what license, and which are here (judged by their size)."""
     from dpcli.evaluate.commands.weights import list_weights
@@ -33,7 +25,6 @@ def list_command(weights: Folder = None, as_object: Json = False) -> None:
     print_result(list_weights(weights), FormOptions(as_object=as_object))
 
 
-@app.command("check")
 def check_command(names: Names = None, weights: Folder = None, as_object: Json = False) -> None:
     """Compute the digests of the weights that are here; exit 3 if one is damaged, or is named and absent."""
     from dpcli.evaluate.commands.weights import check_named_weights
@@ -41,7 +32,6 @@ def check_command(names: Names = None, weights: Folder = None, as_object: Json =
     print_result(check_named_weights(names or [], weights), FormOptions(as_object=as_object))
 
 
-@app.command("fetch")
 def fetch_command(
     names: Names = None,
     everything: Annotated[bool, typer.Option("--all", help="Fetch all of them, 2.4 GB.")] = False,

@@ -138,13 +138,20 @@ class NumberColumns:
         return text + splitext(first.text)[1]
 
     def running_numbers(self) -> np.ndarray | None:
-        """Returns the whole numbers in which the names differ, i64 (F); None when they differ in more, or in none."""
-        varying = self.varying()
-        if len(varying) != 1 or any("." in number for number in self.columns[varying[0]]):
-            return None
-        numbers = [int(number) for number in self.columns[varying[0]]]
-        rising = all(a < b for a, b in zip(numbers, numbers[1:]))
-        return np.array(numbers, np.int64) if rising and numbers[-1] < 2**62 else None
+        """Returns the whole numbers that rise from name to name, i64 (F), of several such columns those that do so by the
+        smallest steps: another one tells times; None without one.
+        """
+        found = []
+        for column in self.varying():
+            if not any("." in number for number in self.columns[column]):
+                numbers = [int(number) for number in self.columns[column]]
+                if all(a < b for a, b in zip(numbers, numbers[1:])) and numbers[-1] < 2**62:
+                    found.append(numbers)
+        return np.array(min(found, key=lambda own: own[-1] - own[0]), np.int64) if found else None
+
+    def tells_times(self, column: int) -> bool:
+        """Returns whether all numbers of a column are dates or seconds, or may be times since 1970."""
+        return self._seconds(column) is not None
 
     def times(self) -> np.ndarray | None:
         """Returns the seconds between the first name's time and each, f64 (F); None unless all hold times, rising."""

@@ -11,11 +11,11 @@ import typer
 from dpcli.classify.explain.pac_settings import PacSettings
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.settings import TRAINING
-from dpcli.cli.classify.app import app
+from dpcli.cli.classify.app import ROOM
 from dpcli.errors import UsageError
 from tests.support.commands import exit_code
 
-GROUP = typer.main.get_command(app)
+GROUP = typer.main.get_command(ROOM.application())
 TRAIN = "output preset init fine-tune frames points timing epochs batch lr validation config set help-all seed device force".split()
 
 

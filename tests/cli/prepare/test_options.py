@@ -6,8 +6,7 @@ from typing import get_args
 
 import pytest
 
-from dpcli.cli import app as cli
-from dpcli.cli.prepare.app import app, synthetic
+from dpcli.cli.prepare.app import ROOM, SYNTHETIC
 from dpcli.cli.prepare.lists import degrees, three_shares, whole_numbers, words
 from dpcli.errors import UsageError
 from dpcli.prepare import thinning
@@ -21,8 +20,8 @@ from tests.support.prepare_helpers import dpc
 
 def legal_words(path: str, option: str) -> list[str]:
     *group, name = path.split()
-    commands = (synthetic if group else app).registered_commands
-    run = next(entry.callback for entry in commands if cli._name(entry) == name)
+    commands = (SYNTHETIC if group else ROOM).application((name,)).registered_commands
+    (run,) = (entry.callback for entry in commands)
     literal, _ = get_args(run.__annotations__[option[2:].replace("-", "_")])
     return list(get_args(literal))
 

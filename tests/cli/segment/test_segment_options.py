@@ -8,7 +8,7 @@ import sys
 import pytest
 import typer
 
-from dpcli.cli.segment.app import app
+from dpcli.cli.segment.app import ROOM
 from dpcli.cli.segment.profile import render_cost
 from dpcli.errors import DataError
 from dpcli.segment import prediction_settings
@@ -17,7 +17,7 @@ from dpcli.segment.network.config import NETWORK_PRESETS, PartConfig, compact, r
 from dpcli.segment.training import settings as train_settings
 from tests.support.commands import exit_code
 
-GROUP = typer.main.get_command(app)
+GROUP = typer.main.get_command(ROOM.application())
 EVERYDAY = {
     "train": "output preset init flow supervised epochs batch lr points validation config set help-all seed device force",
     "flow": "output preset steps batch config set help-all seed device force",

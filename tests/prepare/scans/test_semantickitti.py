@@ -196,14 +196,14 @@ def test_recipes_agree_with_the_readers(name):
     tomllib = pytest.importorskip("tomllib" if sys.version_info >= (3, 11) else "tomli")
     from typer.main import get_command
 
-    from dpcli.cli.prepare.app import app
+    from dpcli.cli.prepare.app import ROOM
     from dpcli.prepare.articulated import ogc, ogc_rooms
     from dpcli.prepare.scans import kitti_det, kitti_sf
 
     recipe = tomllib.loads((ROOT / "data_recipes" / f"{name}.toml").read_text())
     assert recipe["name"] == name and {"ask", "license"} <= recipe["get"].keys() and recipe["layout"]["tree"]
     program, *words = shlex.split(recipe["prepare"]["command"])
-    assert [program, *words[:2]] == ["dpc", "prepare", name] and name in get_command(app).commands
+    assert [program, *words[:2]] == ["dpc", "prepare", name] and name in get_command(ROOM.application()).commands
     split, count = recipe["split"], recipe["expect"]["sequences"]
     if name.startswith("ogc"):
         assert count == ogc.ROOMS == sum(split[key] for key in ("train", "validation", "test"))
