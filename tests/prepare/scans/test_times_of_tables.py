@@ -37,6 +37,8 @@ def csv(path, header, rows):
         ("timestamp", [1_234_567_890, 1_234_617_890], None),  # microseconds since the sensor began
         ("timestamp", [1_700_000_000, 1_700_000_030], [0, 30]),
         ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
+        ("time", ["11:59:59 AM", "12:00:00.5 pm"], [0, 1.5]),
+        ("time", [45356.5, 45356.500001157], None),  # days, as spreadsheets count them
         ("time", ["1 day, 0:00:01", "2 days, 0:00:01"], [0, 86400]),
     ],
 )
@@ -74,6 +76,9 @@ def test_names_of_frames_in_the_order_of_the_alphabet_are_put_in_that_of_their_n
     logged = [f"frame_{k}.pcd" for k in (8, 9, 10, 1)]
     path = csv(tmp_path / "b.csv", "frame,x,y,z", [(name, int(name[6:-4]), 1, 2) for name in logged])
     assert only_sequence(path)[0].points[:, 0].tolist() == [8, 9, 10, 1]
+    clocks = ["11:59:59:07", "12:00:01:02", "1:00:00:01"]  # in the alphabet's order by chance
+    path = csv(tmp_path / "d.csv", "frame,x,y,z", [(clock, k, 1, 2) for k, clock in enumerate(clocks)])
+    assert only_sequence(path)[0].points[:, 0].tolist() == [0, 1, 2]
     csv(tmp_path / "c.csv", "frame,x,y,z", [("a", 1, 1, 1), ("", 1, 1, 1)])
     (item,) = TableSequences(tmp_path / "c.csv").items()
     assert "1 rows, the first is 2, have no number in 'frame'" in item.problem
