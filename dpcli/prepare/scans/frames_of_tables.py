@@ -17,6 +17,8 @@ SINGLE = (
 )
 FELL = "sequences whose frame numbers fall on the way, put in the order of the numbers (--gap N begins a new sequence there)"
 WRAPPED = "sequences whose frame numbers begin anew at 0 when their counter is full; their frames stay in their order"
+ROUNDED = "sequences whose frame column seems rounded by float32, which makes one frame of several; save it in float64"
+_SPARSE = 2**30
 _EXACT = 2**53  # up to here every whole number is a float64
 _FULL = (2**8, 2**16, 2**32)  # what a counter of 8, 16 or 32 bits never reaches
 JOINED = "frames whose rows were joined, as their numbers come again later (--gap N begins a new sequence there)"
@@ -179,8 +181,15 @@ def _in_frames(name: str, frames: np.ndarray, numbers: np.ndarray | None, rows: 
     values, starts = np.unique(own[order], return_index=True)
     offsets = np.append(starts, len(rows)).astype(np.int64)
     joined = runs - len(values)
+    notes += [ROUNDED] if numbers is not None and _are_rounded(values) else []
     notes += [FELL] if falls and not joined and numbers is not None else []
     return Rows(name, rows[order], offsets, None if numbers is None else values, joined=joined, notes=tuple(notes))
+
+
+def _are_rounded(numbers: np.ndarray) -> bool:
+    """Returns whether large numbers (T) are all such as float32 has, whose neighbors there are 128 or more apart."""
+    with np.errstate(over="ignore"):
+        return bool(len(numbers) and abs(numbers[-1]) >= _SPARSE and (numbers.astype(np.float32) == numbers).all())
 
 
 def _fills_counter(numbers: np.ndarray) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dpcli.prepare.scans.frames_of_tables import ROUNDED
 from dpcli.prepare.scans.tables import TableSequences
 
 RNG = np.random.default_rng(0)
@@ -90,6 +91,13 @@ def test_numbers_that_no_float_holds_stay_apart(tmp_path, first):
     sequence, _ = only_sequence(csv(tmp_path / "a.csv", "frame,x,y,z", rows), fps=10)
     assert sequence.num_frames == 4
     np.testing.assert_allclose(sequence.time, [0, 0.1, 0.2, 0.3])
+
+
+def test_times_that_float32_rounded_are_told(tmp_path):
+    for moments, told in (([1_709_640_064] * 2, True), ([1_709_640_000, 1_709_640_001], False), ([128, 256], False)):
+        csv(tmp_path / "a.csv", "time,x,y,z", [(moment, 1, 2, k) for k, moment in enumerate(moments)])
+        reader = TableSequences(tmp_path / "a.csv", frame_column="time")
+        assert (ROUNDED in reader.read(reader.items()[0], RNG).notes) == told
 
 
 def test_numbers_of_frames_in_groups_of_thousands(tmp_path):
