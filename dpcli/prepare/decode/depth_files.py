@@ -272,7 +272,7 @@ def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
     """
     if data.startswith((b"Pf", b"PF")):
         words = data[:200].split(None, 4)[:4]
-        if len(words) == 4 and words[3].lstrip(b"+-").rstrip(b"0").rstrip(b".") not in (b"1", b""):
+        if len(words) == 4 and not re.fullmatch(rb"[-+]?1(\.0*)?", words[3]):
             raise DataError(
                 f"{path}: its header gives the scale {words[3].decode('latin-1')}, by which some readers divide and others"
                 " don't; save it with the scale 1 or -1"

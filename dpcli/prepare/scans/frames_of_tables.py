@@ -46,7 +46,8 @@ class Rows:
         since = self.frames - self.frames[0]
         unit = 1.0 if self.clock else seconds_of(column, self.frames)
         if unit:
-            return _rising(since * unit)
+            told = _rising(since * unit)
+            return told if told is not None or not fps else np.arange(len(since)) / fps
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
         return since / max(int(step), 1) / fps if fps else None
 

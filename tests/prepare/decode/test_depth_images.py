@@ -122,9 +122,10 @@ def test_white_at_zero_is_told_and_changes_no_number(tmp_path, kind):
 
 def test_pictures_that_opencv_would_change_are_refused(tmp_path):
     values = np.ones((2, 3), np.float32)
-    (tmp_path / "a.pfm").write_bytes(b"Pf\n3 2\n-2.0\n" + values.tobytes())
-    with pytest.raises(DataError, match="its header gives the scale -2.0"):
-        read_frame(tmp_path / "a.pfm")
+    for scale in ("-2.0", "-10", "0.5"):
+        (tmp_path / "a.pfm").write_bytes(f"Pf\n3 2\n{scale}\n".encode() + values.tobytes())
+        with pytest.raises(DataError, match=f"its header gives the scale {scale}"):
+            read_frame(tmp_path / "a.pfm")
     for scale in (b"-1", b"-1.0", b"-1.000000"):
         (tmp_path / "a.pfm").write_bytes(b"Pf\n3 2\n" + scale + b"\n" + values.tobytes())
         np.testing.assert_array_equal(read_frame(tmp_path / "a.pfm"), values)

@@ -54,6 +54,12 @@ def test_units_in_the_names_of_times(tmp_path, name, values, expected):
         np.testing.assert_allclose(sequence.time, expected, atol=1e-6)
 
 
+def test_a_column_of_days_numbers_frames_by_their_rate(tmp_path):
+    path = csv(tmp_path / "a.csv", "time,x,y,z", [(45356.5 + k * 1.157e-5, k, 1, 2) for k in range(3)])
+    assert only_sequence(path, frame_column="time")[0].time is None
+    np.testing.assert_allclose(only_sequence(path, frame_column="time", fps=10)[0].time, [0, 0.1, 0.2])
+
+
 @pytest.mark.parametrize(
     ("names", "parts"),
     [("stamp.sec,stamp.nanosec", 1e9), ("secs,nsecs", 1e9), ("ts_sec,ts_usec", 1e6), ("time_s,time_ms", 1e3)],
