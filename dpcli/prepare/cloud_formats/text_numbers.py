@@ -181,15 +181,19 @@ class TextTable:
         """Returns the decimal sign of cells without commas. Raises DataError where a column of points in groups of three digits
         holds whole numbers, too, as where they divide thousands.
         """
-        for place in places:
-            column = [row[place] for row in rows]
-            pointed = [cell for cell in column if "." in cell]
-            if any(cell.count(".") > 1 for cell in pointed):
-                return ","
+        columns = [[row[place] for row in rows] for place in places]
+        pointed = [cell for column in columns for cell in column if "." in cell]
+        grouped = next((cell for cell in pointed if cell.count(".") > 1 and _POINTED.fullmatch(cell)), "")
+        if grouped and (other := next((cell for cell in pointed if not _POINTED.fullmatch(cell)), "")):
+            raise DataError(f"{self.path}: numbers such as {grouped} beside {other}; expected one style")
+        if grouped:
+            return ","
+        for column in columns if self.delimiter in (";", "\t") else []:
+            own = [cell for cell in column if "." in cell]
             whole = [cell for cell in column if _BELOW_THOUSAND.fullmatch(cell)]
-            if self.delimiter in (";", "\t") and pointed and whole and all(map(_POINTED.fullmatch, pointed)):
+            if own and whole and all(map(_POINTED.fullmatch, own)):
                 raise DataError(
-                    f"{self.path}: {pointed[0]} beside {whole[0]} may be {pointed[0].replace('.', '')} or {pointed[0]};"
+                    f"{self.path}: {own[0]} beside {whole[0]} may be {own[0].replace('.', '')} or {own[0]};"
                     " expected numbers without groups of thousands"
                 )
         return "."

@@ -111,6 +111,8 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("1,5, 2,25, 3,5\n4,5, 5,25, 6,5\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
+        ("x;y;z\n448.262.123;2;0.512\n", "numbers such as 448.262.123 beside 0.512; expected one style"),
+        ("x y z\n1 2 3\n1.2.3 2 3.5\n", "a.csv:3: column 'x' holds '1.2.3'"),
         ("x;y;z\n1.500;2;3\n500;2;3\n", "1.500 beside 500 may be 1500 or 1.500"),
         ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
