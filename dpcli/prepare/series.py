@@ -21,6 +21,7 @@ from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, tell_unclear_order
 
 _LISTED = 5
+_HEX = re.compile(r"(.*?)([0-9a-f]+)", re.IGNORECASE)
 _SIXTY = 60  # minutes and seconds end below
 TEXTS = (".txt", ".csv", ".tsv")
 _BESIDE = re.compile(
@@ -141,6 +142,9 @@ def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
     groups: dict[tuple[str, str], list[Name]] = {}
     for name in map(parse_name, names):
         groups.setdefault((name.shape if name.numbers else "", name.suffix), []).append(name)
+    if len(groups) > 1 and (hexadecimal := _counted_in_hex(names)):
+        suffix = splitext(names[0])[1].lower()
+        return [Series(folder, tuple(hexadecimal), f"*{suffix}", numbered=False, suffix=suffix)]
     found = [_made(folder, part) for group in groups.values() for part in _objects(group)]
     scattered = sum(len(one.names) for one in found if one.numbered and len(one.names) == 1)
     if scattered > 2 and 2 * scattered > sum(len(one.names) for one in found if one.numbered):
@@ -190,6 +194,17 @@ def _joined(folder: Path, found: list[Series]) -> list[Series]:
         Series(folder, tuple(sorted(names, key=natural_key)), f"*{suffix}", numbered=False, suffix=suffix)
         for suffix, names in by_suffix.items()
     ]
+
+
+def _counted_in_hex(names: Sequence[str]) -> list[str]:
+    """Returns names that hexadecimal numbers of one length count without a gap, in their order; [] of others, such as hashes."""
+    found = [_HEX.fullmatch(splitext(name)[0]) for name in names]
+    suffixes = {splitext(name)[1].lower() for name in names}
+    if not all(found) or len(suffixes) > 1 or len({(match[1], len(match[2])) for match in found if match}) > 1:
+        return []
+    numbers = {int(match[2], 16): name for match, name in zip(found, names) if match}
+    gapless = len(numbers) == len(names) == max(numbers) - min(numbers) + 1
+    return [numbers[number] for number in sorted(numbers)] if gapless else []
 
 
 def choose_series(

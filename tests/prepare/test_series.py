@@ -101,6 +101,7 @@ def test_nothing_but_texts_about_frames_is_no_clip():
         (["315966265259836000.bin", "315966265359836000.bin"], [0, 0.1]),
         (["v1.2.ply", "v1.9.ply", "v1.10.ply"], None),
         (["frame_1.ply", "frame_2.ply", "frame_10.ply"], None),
+        ([f"f_{k:03x}.ply" for k in range(0x98, 0xA4)], None),
         (["1234567890_000001.ply", "1234567890_000002.ply"], None),
         (["10-00.ply", "10-30.ply", "11-00.ply", "11-30.ply"], None),
         (["1305031102-100000.ply", "1305031102-200000.ply", "1305031103-100000.ply", "1305031103-200000.ply"], None),
