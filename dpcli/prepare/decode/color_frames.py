@@ -16,7 +16,7 @@ from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
 from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
@@ -204,6 +204,7 @@ def _cameras_beside(folder: Path) -> list[str]:
 def read_rgba(path: Path) -> np.ndarray:
     """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
     with _readable(path) as image:
+        require_one_picture(path, image)
         return _to_rgba(as_shown(image), path)
 
 

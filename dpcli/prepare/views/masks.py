@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import open_image, upright
+from dpcli.runtime.clips.images import open_image, require_one_picture, upright
 from dpcli.runtime.progress import log
 
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
@@ -30,6 +30,7 @@ def read_mask(path: Path) -> np.ndarray:
     """
     try:
         with open_image(path) as stored:
+            require_one_picture(path, stored)
             lossy = stored.format in ("JPEG", "AVIF") or stored.format == "WEBP" and not _is_lossless(path)
             image = upright(stored)
             if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
