@@ -306,10 +306,15 @@ def test_colors_that_are_not_converted_are_refused(pictures, tmp_path):
         look_at_video(film(pictures, tmp_path / "c.mp4", *PLAIN, *tag))
 
 
-def test_interlaced_lines_are_told(pictures, tmp_path, capfd):
+def test_interlaced_lines_are_told_in_some_frames_as_in_all(pictures, tmp_path, capfd):
     words = ("-c:v", "mpeg2video", "-r", 25, "-vf", "setfield=tff,interlace", "-flags", "+ilme+ildct")
-    look_at_video(film(pictures, tmp_path / "i.ts", *words))
-    assert "interlaced: each frame shows two moments" in capfd.readouterr().err
+    woven = film(pictures, tmp_path / "i.ts", *words)
+    count = look_at_video(woven).count
+    assert "i.ts: interlaced: each shows two moments" in capfd.readouterr().err
+    plain = film(pictures, tmp_path / "p.ts", "-c:v", "mpeg2video", "-r", 25)
+    (tmp_path / "both.ts").write_bytes(plain.read_bytes() + woven.read_bytes())
+    whole = look_at_video(tmp_path / "both.ts").count
+    assert f"both.ts: interlaced in {count} of {whole} frames: each shows" in capfd.readouterr().err
 
 
 def test_an_hdr_clip_is_named(pictures, tmp_path, capfd):
