@@ -202,6 +202,9 @@ def test_pages_of_a_tiff_are_no_clip(tmp_path):
         (["13-02-2024 10.00.00.png", "14-01-2024 10.00.00.png"], ""),
         (["shot 12.00.00 PM.png", "shot 1.00.00 PM.png"], "clocks of 12 hours"),
         (["cam 1pma.png", "cam 2pma.png"], ""),
+        (["a 23-59-59.png", "a 00-00-01.png"], "whether these times of day go on past midnight"),
+        (["a 13-59-59.png", "a 14-00-01.png"], ""),
+        (["2024-02-13 23.59.59.png", "2024-02-14 00.00.01.png"], ""),
     ],
 )
 def test_names_that_may_mean_two_times_are_told(names, words, tmp_path, capfd):
