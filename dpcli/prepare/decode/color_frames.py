@@ -231,7 +231,7 @@ def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
         top = gray.max(initial=0)
-        unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        unit = 1 / 255 if image.mode == "F" and top < 2 else 257.0 if top > 255 else 1.0
         if unit == 1 and top and image.mode != "F":
             with log.each_once(_SAID):
                 log.warn(

@@ -104,7 +104,7 @@ def _of_colors(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
 def _of_values(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
     """Returns the mask u8 (H,W) of gray values (H,W) of any type."""
     top = values.max(initial=0)
-    if values.dtype.kind == "f" and top <= 1:
+    if values.dtype.kind == "f" and top < 2:  # up to 1, and a little beyond where a filter overshot
         return np.round(255 * values.clip(0, 1)).astype(np.uint8)
     if lossy and 0 < top < _SMALL_LABEL:
         raise DataError(

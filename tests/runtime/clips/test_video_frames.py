@@ -496,7 +496,7 @@ def test_masks_that_cannot_be_told_are_refused(tmp_path, values, name, message):
         read_mask(tmp_path / name)
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency", "palette"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "overshot", "alpha", "transparency", "palette"])
 def test_a_soft_mask_stays_soft(tmp_path, kind):
     y, x = np.mgrid[:48, :64]
     soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
@@ -505,11 +505,14 @@ def test_a_soft_mask_stays_soft(tmp_path, kind):
         "8 bits": Image.fromarray(soft),
         "16 bits": Image.fromarray(soft.astype(np.uint16) * 257),
         "floats": Image.fromarray(soft.astype(np.float32) / 255),
+        "overshot": Image.fromarray(
+            np.where(soft == 255, 1.04, np.where(soft == 0, -0.02, soft / 255)).astype(np.float32)
+        ),
         "alpha": Image.fromarray(np.stack([soft * 0, soft], -1)),
         "transparency": Image.fromarray(soft).convert("P"),
         "palette": Image.fromarray(soft).convert("RGB").quantize(256),
     }[kind]
-    name, words = ("m.tif", {}) if kind == "floats" else ("m.png", {})
+    name, words = ("m.tif", {}) if kind in ("floats", "overshot") else ("m.png", {})
     words = {"transparency": bytes(range(256))} if kind == "transparency" else words
     image.save(tmp_path / name, **words)
     np.testing.assert_array_equal(read_mask(tmp_path / name), soft)
