@@ -57,7 +57,8 @@ def _of_palette(path: Path, image) -> np.ndarray:  # image: PIL.Image.Image
     numbers, colors = np.array(image), np.array(image.convert("RGB"))
     used, first = np.unique(numbers, return_index=True)
     shown = colors.reshape(-1, 3)[first].astype(int)
-    if not np.ptp(shown, axis=1).any() and len(np.unique(shown[:, 0])) == len(used):
+    gray = not np.ptp(shown, axis=1).any() and len(np.unique(shown[:, 0])) == len(used)
+    if gray and (shown.min() < _NOISE or len(used) == 1):
         return _of_values(path, colors[..., 0], False)
     black = ~shown.any(1)
     if black.any() and used[0] == 0 and not black[0]:

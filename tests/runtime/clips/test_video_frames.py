@@ -462,6 +462,7 @@ BLACK, WHITE, RED, GREEN = (0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 200, 0)
         pytest.param(with_palette(LABELS == 0, WHITE, BLACK), id="white is number 0"),
         pytest.param(with_palette(np.choose(LABELS, [1, 0, 2]), RED, BLACK, GREEN), id="black is number 1"),
         pytest.param(with_palette(LABELS, WHITE, RED, GREEN), id="on white paper"),
+        pytest.param(with_palette(LABELS, (128, 128, 128), WHITE, (200, 200, 200)), id="on gray paper"),
         pytest.param(with_palette(LABELS, BLACK, BLACK, BLACK), id="without colors"),
         pytest.param(with_palette(LABELS * 0, WHITE), id="white alone"),
         pytest.param(colors_of(RED, GREEN).quantize(4), id="made smaller"),
