@@ -197,10 +197,8 @@ def _cameras_beside(folder: Path) -> list[str]:
     """
     places = [folder, folder.resolve().parent] if folder.resolve().name.lower() in PICTURE_FOLDERS else [folder]
     beside = [name for name in _CAMERAS if any((place / name).exists() for place in places)]
-    exported = next(
-        (path for path in sorted(folder.glob("*.xmp")) if b"xcr:" in path.read_bytes()), None
-    )  # of RealityCapture
-    return [*beside, exported.name] if exported else beside
+    exported = sorted(folder.glob("*.xmp"))[:1]  # of RealityCapture, one for each image
+    return [*beside, *(path.name for path in exported if b"xcr:" in path.read_bytes())]
 
 
 def read_rgba(path: Path) -> np.ndarray:

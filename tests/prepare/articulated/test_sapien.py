@@ -199,7 +199,9 @@ def test_meshes_that_cannot_be_used(tmp_path):
         load(with_mesh("a.xyz", "1 2 3"))
     with pytest.raises(DataError, match="its mesh .*bad.glb: not a glTF file"):
         load(with_mesh("bad.glb", "nonsense"))
-    assert load(with_mesh("bad.stl", "nonsense")).notes["mesh files without faces"] == 1
+    with pytest.raises(DataError, match="its mesh .*bad.stl: truncated: its header alone has 84 bytes, it holds 8"):
+        load(with_mesh("bad.stl", "nonsense"))
+    assert load(with_mesh("empty.stl", "solid a\nendsolid a\n")).notes["mesh files without faces"] == 1
     flat = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
     obj = load(with_mesh("flat.obj", flat))
     assert obj.notes["triangles without area dropped"] == 1 and obj.body_areas[0] == 0
@@ -551,10 +553,9 @@ def test_nothing_outside_the_folder_is_opened(name, tmp_path):
 def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
     (tmp_path / "robot" / "meshes").mkdir(parents=True)
     (tmp_path / "robot" / "meshes" / "c.obj").write_text(CUBE_OBJ)
-    inside = tmp_path / "robot/meshes/c.obj"
-    names = ("../meshes/c.obj", "package://robot/meshes/c.obj", inside, f"file://{inside}", "package:///meshes/c.obj")
+    names = ("../meshes/c.obj", "package://robot/meshes/c.obj", "package:///meshes/c.obj")
     shapes = [link(f"b{k}", f'<mesh filename="{name}"/>') for k, name in enumerate(names)]
-    elements = [link("a"), *shapes, *(joint(f"j{k}", "a", f"b{k}") for k in range(5))]
+    elements = [link("a"), *shapes, *(joint(f"j{k}", "a", f"b{k}") for k in range(3))]
     (tmp_path / "robot" / "urdf").mkdir()
     write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
     assert not Sapien(tmp_path).items()[0].problem
