@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
+from math import prod
 from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 
 _ROOM, _PACKED_AT_MOST = 100 << 20, 50  # bytes that any file may unpack to; and times its size beyond them
 
@@ -16,6 +19,31 @@ def require_room(path: Path, claimed: int) -> None:
     held = path.stat().st_size
     if claimed > _ROOM + _PACKED_AT_MOST * held:
         raise DataError(f"{path}: claims {claimed} bytes of arrays; a file of {held} bytes can't hold such clouds")
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays of a `.npz` by name; other files in the archive are passed over.
+
+    Raises DataError when it is damaged, needs a pickle, or an array has other bytes than its header says.
+    """
+    with reading(path), zipfile.ZipFile(path) as archive:
+        require_room(path, sum(info.file_size for info in archive.infolist()))
+        members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+        return {one.filename[: -len(".npy")]: read_member(path, archive.read(one)) for one in members}
+
+
+def read_member(path: Path, data: bytes) -> np.ndarray:
+    """Returns the array that the bytes of a `.npy` describe. DataError where its header claims another number of bytes."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(stream)
+    claimed, held = prod(shape) * dtype.itemsize, len(data) - stream.tell()
+    if not dtype.hasobject and (claimed != held or min(shape, default=0) < 0):
+        raise DataError(
+            f"{path}: an array claims shape {str(shape)[:60]} of {dtype.itemsize} bytes each and has {held} bytes; damaged"
+        )
+    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def map_npy(path: Path) -> np.ndarray:
@@ -29,7 +57,9 @@ def map_npy(path: Path) -> np.ndarray:
     except FileNotFoundError:
         raise
     except Exception as error:  # ValueError, EOFError, tokenize.TokenError, SyntaxError... of damaged headers
-        said = (str(error).splitlines() or [""])[0]
+        said = (
+            "it needs a pickle, which isn't loaded" if "pickle" in str(error) else (str(error).splitlines() or [""])[0]
+        )
         raise DataError(
             f"{path}: not a readable .npy array, perhaps truncated ({said or type(error).__name__})"
         ) from None

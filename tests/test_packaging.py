@@ -19,6 +19,7 @@ PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 # import name -> distribution, where they differ
 DISTRIBUTION = {
     "PIL": "pillow",
+    "collada": "pycollada",
     "cv2": "opencv-python-headless",
     "sklearn": "scikit-learn",
     "yaml": "pyyaml",

@@ -6,7 +6,6 @@ import errno
 import functools
 import math
 import os
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -18,6 +17,7 @@ import typer
 
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedCommand, SectionedGroup
+from dpcli.cli.out_of_memory import memory_sentence, naming_large, out_of_memory
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
@@ -38,8 +38,18 @@ ROOMS = {
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE = 141  # what a shell reports for SIGPIPE
 # What is wrong with a path that was given, rather than with the machine.
-_PLACES = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR)
+_PLACES = (
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ENXIO,
+)
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
+_MOST = 10**7  # of a whole number that says how much: lists of more take gigabytes before any work begins
 
 
 def _version(wanted: bool) -> None:
@@ -136,15 +146,13 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
-    full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
+    named = error.filename if isinstance(error, OSError) else None
+    full = disk_full(named or "the output", error, place=named) if isinstance(error, OSError) else None
     if full is not None:
         log.error(str(full))
         return full.exit_code
-    if _out_of_memory(error):
-        log.error(
-            f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
-            " at a time: --batch, or --set accumulate=2 in `classify train`, --points, --frames, --size, --jobs"
-        )
+    if out_of_memory(error):
+        log.error(memory_sentence(error))
         return 1
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
@@ -152,39 +160,41 @@ def _explain(error: BaseException) -> int:
     raise error
 
 
-def _out_of_memory(error: BaseException) -> bool:
-    """numpy raises MemoryError, torch RuntimeError: on a GPU a kind of its own, on a CPU a plain one."""
-    text = str(error)
-    said = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and said)
+def _check_value(value: Any, option: Any) -> None:
+    """Raises UsageError for a number that is none, or too large for float32 or a count, DataError for what nobody may read."""
+    if isinstance(value, float) and not abs(value) < _LARGEST and value != option.default:
+        below = f" below {_LARGEST:g}" if math.isfinite(value) else ""
+        raise UsageError(f"{option.opts[-1]} {value}: expected a finite number{below}")
+    counts = type(value) is int and option.type_descriptor.parameter_info.parser is None  # no seed, which has a parser
+    if counts and abs(value) > _MOST:
+        raise UsageError(f"{option.opts[-1]} {value}: expected a whole number up to {_MOST}")
+    if isinstance(value, Path) and option.name not in _WRITTEN and value.exists() and not os.access(value, os.R_OK):
+        raise DataError(f"{value}: permission denied")
 
 
-def _asked_for(said: str) -> str:
-    found = re.search(r"allocate ([\d.]+) ?(\w+)", said)
-    if found is None:
-        return ""
-    from rich.filesize import decimal
+def _checking_values(command: Any) -> Any:
+    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default, and where
+    nobody may read a path.
 
-    return f" ({decimal(int(found[1])) if found[2] == 'bytes' else ' '.join(found.groups())} more were asked for)"
-
-
-def _refusing_nan(command: Any) -> Any:
-    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default."""
+    Where memory ends, options far above their defaults are named.
+    """
     for below in getattr(command, "commands", {}).values():
-        _refusing_nan(below)
+        _checking_values(below)
     run = command.callback
     if run is None:
         return command
     options = {one.name: one for one in command.params}
+    for one in command.params:
+        one.type_descriptor.parameter_info.readable = False  # typer would call it wrong use; see below
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:
         for name, value in values.items():
-            for number in value if isinstance(value, (list, tuple)) else [value]:
-                if isinstance(number, float) and not abs(number) < _LARGEST and number != options[name].default:
-                    below = f" below {_LARGEST:g}" if math.isfinite(number) else ""
-                    raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number{below}")
-        return run(*args, **values)
+            for one in value if isinstance(value, (list, tuple)) else [value]:
+                _check_value(one, options[name])
+        given = {f"{options[name].opts[-1]} {value}": (value, options[name].default) for name, value in values.items()}
+        with naming_large(given):
+            return run(*args, **values)
 
     command.callback = checked
     return command
@@ -229,7 +239,7 @@ def _keeping_inputs(command: Any) -> Any:
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
+    command = _keeping_inputs(_checking_values(typer.main.get_command(application(_words_to_complete() or arguments))))
     code = _run(command, arguments)
     let_end()
     ended = signal_outcome() or (INTERRUPTED, "interrupted")

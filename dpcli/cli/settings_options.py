@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from dpcli.cli.help_groups import SETTINGS
+from dpcli.cli.out_of_memory import naming_large
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import Setting, settings_of
 from dpcli.runtime.settings.value_types import metavar, without_none, words_of, write_text
@@ -48,7 +49,12 @@ def options_of(
 
         @functools.wraps(command)
         def run(**values: Any) -> Any:
-            return command(**{receiver: _take(catalog, everyday, values)}, **values)
+            given = _take(catalog, everyday, values)
+            usual = {name: one.default for name, one in catalog.settings.items()}
+            with naming_large(
+                {f"{name} = {write_text(value)}": (value, usual[name]) for name, value in given.values.items()}
+            ):
+                return command(**{receiver: given}, **values)
 
         parameters = [two for name, one in own.items() for two in (made if name == receiver else [one])]
         keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]

@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.draw.palette import DARK, RGB, Theme
 from dpcli.errors import DataError
 from dpcli.runtime.whole_file import whole_file
+from dpcli.standard_streams import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,8 +69,8 @@ def text_font(size: int) -> Any:
 
 
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB, size: int = 13) -> None:
-    """Writes a text in one line on a PIL drawing, shortened to the room (pixels) there is."""
-    font = text_font(size)
+    """Writes a text in one line on a PIL drawing, shortened to the room (pixels) there is; names may hold ends of lines."""
+    font, text = text_font(size), printable(text)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"
     draw.text(place, text, fill=ink, font=font)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog, Given
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import WIDEST, check, setting
 
 Start = Literal["auto", "sphere", "inflate", "hull"]
 Prior = Literal["auto", "none", "inflated", "network", "views", "zero123"]
@@ -26,7 +26,7 @@ class FitConfig:
     Raises UsageError for a value that is not legal.
     """
 
-    size: int = setting(256, "Longer side of the fitted pictures, pixels.", least=16)
+    size: int = setting(256, "Longer side of the fitted pictures, pixels.", least=16, most=8192)
     dense_steps: int = setting(1000, "Steps of the dense stage, in which every Gaussian moves by itself.", least=1)
     sparse_steps: int = setting(500, "Steps of the sparse stage, in which control points carry the Gaussians.", least=0)
     batch: int = setting(4, "Pictures per step.", least=1)
@@ -38,11 +38,13 @@ class FitConfig:
     start_radius: float = setting(0.5, "Radius of the sphere of start = sphere, scene units.", above=0)
     gaussians: int = setting(4096, "Gaussians at the start.", least=16)
     most_gaussians: int = setting(80_000, "Gaussians at most; fewer than `gaussians` also start with fewer.", least=16)
-    parts: int = setting(8, "Rigid parts at most; the fit itself blends the motions of 8 at most.", least=1)
+    parts: int = setting(8, "Rigid parts at most; the fit itself blends the motions of 8 at most.", least=1, most=1000)
     control_points: int = setting(512, "Control points at most.", least=1)
     neighbors: int = setting(8, "Control points that move one Gaussian.", least=1)
-    width: int = setting(256, "Units of a layer of the motion networks.", least=1)
-    depth: int = setting(8, "Layers of the deformation network; the other networks have half as many.", least=1)
+    width: int = setting(256, "Units of a layer of the motion networks.", least=1, most=WIDEST)
+    depth: int = setting(
+        8, "Layers of the deformation network; the other networks have half as many.", least=1, most=100
+    )
     partition: Literal["static", "time"] = setting(
         "static", "static: a point keeps its part; time: a part may gain and lose points while the clip plays."
     )
@@ -72,7 +74,7 @@ class FitConfig:
         least=0,
         most=1,
     )
-    shape_size: int = setting(96, "Side of a shape prior's pictures, pixels.", least=16)
+    shape_size: int = setting(96, "Side of a shape prior's pictures, pixels.", least=16, most=1024)
     views: float = setting(1.0, "Weight of given novel views, as a share of the reconstruction's.", least=0)
     augmentation: float = setting(1.0, "Weight of score distillation, eq. C.11.", least=0)
     identification: float = setting(1.0, "Weight of both losses that find parts.", least=0)

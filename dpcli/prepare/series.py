@@ -21,6 +21,7 @@ from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, tell_unclear_order
 
 _LISTED = 5
+_SIXTY = 60  # minutes and seconds end below
 TEXTS = (".txt", ".csv", ".tsv")
 _BESIDE = re.compile(
     r"(read[-_ ]?me|licen[cs]e|copying|changelog|notes?|poses?|traj\w*|odom\w*|ground[-_ ]?truth|gt|times?|time_?stamps?|"
@@ -149,18 +150,26 @@ def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
 
 def _objects(group: list[Name]) -> list[list[Name]]:
     """Returns the files of one shape by object, where each object's frames are counted anew, such as ``cup1_0, cup1_1,
-    cup2_0, cup2_1``.
+    cup2_0, cup2_1``, or where several have the same times.
     """
-    varying = NumberColumns(group).varying()
-    if len(varying) < 2 or any(name.is_time[column] for name in group for column in varying):
+    columns = NumberColumns(group)
+    varying = columns.varying()
+    timed = [column for column in varying if columns.tells_times(column)]
+    if len(varying) < 2 or len(timed) > 1:
         return [group]
-    *outer, inner = varying
+    inner = timed[0] if timed else varying[-1]
+    outer = [column for column in varying if column != inner]
     parts: dict[tuple[str, ...], list[Name]] = {}
     for name in group:
         parts.setdefault(tuple(name.numbers[column] for column in outer), []).append(name)
     counts = [sorted(float(name.numbers[inner]) for name in part) for part in parts.values()]
-    anew = all(len(own) > 1 and own == [counts[0][0] + k for k in range(len(own))] for own in counts)
-    return list(parts.values()) if anew and len(parts) > 1 else [group]
+    several = len(parts) > 1 and all(len(own) > 1 for own in counts)
+    if timed:
+        fractions = all(len(name.numbers[column]) in (6, 9) for name in group for column in outer)  # of the seconds
+        return list(parts.values()) if several and not fractions else [group]
+    anew = all(own == [counts[0][0] + k for k in range(len(own))] for own in counts)
+    alike = all(own == counts[0] for own in counts) and counts[0][-1] >= _SIXTY
+    return list(parts.values()) if several and (anew or alike) else [group]
 
 
 def _made(folder: Path, names: list[Name]) -> Series:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from dpcli import __version__
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import utf8_path
+from dpcli.regular_files import why_unreadable
 from dpcli.runtime.settings.stored import from_json, json_value
 from dpcli.runtime.settings.value_types import numbers_in
 from dpcli.runtime.whole_file import whole_file
@@ -48,7 +49,7 @@ def locate_weights(name: str | Path, shipped: Iterable[Path]) -> Path | None:
 
 
 def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str = "--model") -> Path:
-    """Returns the file that a name means, as `locate_weights`; UsageError, which says what to give, when there is none.
+    """Returns the file that a name means, as `locate_weights`; DataError, which says what to give, when there is none.
 
     shipped: the folder of the models that come with the package, None for a kind of which there are none. maker: the
     command that writes such files. A path that was found once is taken as it is, so a command can pass it on.
@@ -59,18 +60,12 @@ def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str
     if Path(name, "config.json").is_file():
         last = Path(name, "last.safetensors")
         now = f"{last} has the weights of its last epoch; " if last.is_file() else ""
-        raise UsageError(
+        raise DataError(
             f"{option} {name}: this training has no best.safetensors yet; {now}run its `{maker}` again to continue it"
         )
-    what = (
-        "holds no trained model"
-        if Path(name).is_dir()
-        else "not a regular file"
-        if Path(name).exists()
-        else "no such file"
-    )
+    what = why_unreadable(name) or ("holds no trained model" if Path(name).is_dir() else "no such file")
     ours = ", ".join(shipped_models(shipped)) if shipped else ""
-    raise UsageError(
+    raise DataError(
         f"{option} {name}: {what}; give a .safetensors file, a folder made by `{maker}`"
         f" or a shipped model ({ours or 'none in this installation'})"
     )

@@ -30,19 +30,38 @@ class DiskFull(DpcError):
 
 
 def disk_full(
-    path: str | Path, error: BaseException | None, advice: str = "make room, then run the same command again"
+    path: str | Path,
+    error: BaseException | None,
+    advice: str = "make room, then run the same command again",
+    place: str | Path | None = "",
+    needed: int = 0,
 ) -> DiskFull | None:
     """Returns the error that a failed write to `path` ends with when there was no room for it, None for any other failure.
 
-    `error` is what the write raised; what it was raised from is looked at, too. `advice` ends the sentence.
+    `error` is what the write raised; what it was raised from is looked at, too. `advice` ends the sentence. `place` lies on
+    the disk that is full where `path` itself is no path; None: nobody knows. `needed`: bytes to be written, 0: nobody knows.
     """
     while error is not None:
         told = _IN_TEXT.search(str(error))
         number = int(told[1] or told[2]) if told else getattr(error, "errno", None)
         if number in _NO_ROOM:
-            return DiskFull(f"{path}: {_NO_ROOM[number]}; {advice}")
+            room = _room(path if place == "" else place, needed) if number == errno.ENOSPC else ""
+            return DiskFull(f"{path}: {_NO_ROOM[number]}{room}; {advice}")
         error = error.__context__  # torch.save hides it behind an error of its own
     return None
+
+
+def _room(place: str | Path | None, needed: int) -> str:
+    """Returns how much is needed and how much is free now on the disk of a place, in words; "" where nobody knows."""
+    from rich.filesize import decimal
+
+    parts = [f"about {decimal(needed)} needed"] if needed else []
+    above = [Path(place).absolute(), *Path(place).absolute().parents] if place else []
+    folder = next((one for one in above if one.is_dir()), None)
+    if folder is not None:
+        disk = shutil.disk_usage(folder)
+        parts.append(f"{decimal(disk.free)} of {decimal(disk.total)} free in {folder}")
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def reserve(file: int, size: int) -> None:
@@ -84,8 +103,8 @@ def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
         yield part
         put_in_place(part, path)
     except BaseException as error:
-        _remove(part)
         full = disk_full(path, error)
+        _remove(part)
         if full is None:
             raise
         raise full from None
@@ -180,11 +199,9 @@ def refuse_folder(path: Path) -> None:
 
 
 def refuse_pipe(path: Path) -> None:
-    """Raises UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise UsageError(
-            f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
-        )
+    """Raises DataError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
+    if path.exists() and (reason := why_unreadable(path)):
+        raise DataError(f"{path}: {reason}; to read from a pipe give `-`: COMMAND | dpc ... -")
 
 
 def check_replaced(folder: Path, own: Sequence[str]) -> None:

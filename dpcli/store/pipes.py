@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
+from dpcli.regular_files import why_unreadable
 from dpcli.runtime.whole_file import DiskFull, check_regular, check_writable, disk_full, refuse_pipe
 
 _PAGES = (".html", ".htm", ".md", ".tex")
@@ -28,7 +29,7 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
     if str(argument) != "-":
         path = Path(argument)
         if not path.exists():
-            raise DataError(f"{path}: no such file")
+            raise DataError(f"{path}: {why_unreadable(path) or 'no such file'}")
         refuse_pipe(path)
         yield path
         return
@@ -62,7 +63,7 @@ def _spool() -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
             yield Path(folder)
     except (DiskFull, OSError) as error:
-        full = disk_full(f"TMPDIR ({place})", error, advice)
+        full = disk_full(f"TMPDIR ({place})", error, advice, place)
         if full is None or not (isinstance(error, DiskFull) or str(error.filename or place).startswith(place)):
             raise
         raise full from None

@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli import app as cli
+from dpcli.cli.out_of_memory import naming_large
 from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.fuzz.forks import Limits, forked
@@ -105,13 +106,23 @@ def test_too_little_memory_is_no_bug(error, expected, capsys):
     assert f"not enough memory on {expected}" in capsys.readouterr().err
 
 
+def test_numbers_that_ask_for_the_memory_are_named(capsys):
+    error = MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)")
+    given = {"--batch 4": (4, 8), "hidden = 4096": (4096, 64), "widths = 64,4096": (((64, 4096),), ((64, 64),))}
+    with pytest.raises(UsageError, match=r"hidden = 4096, widths = 64,4096: .* than this machine has \(7.28 TiB more"):
+        with naming_large(given):
+            raise error
+    with pytest.raises(MemoryError), naming_large({"--batch 4": (4, 8), "--jobs 2": (2, None), "--amp": (True, False)}):
+        raise error
+
+
 def test_another_error_of_torch_s_stays_a_bug():
     with pytest.raises(RuntimeError):
         cli._explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
 
 
 def test_a_network_too_large_for_this_machine_is_told_so(dpc_here):
-    done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**12)
+    done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**6)
     assert done.returncode == 2 and b"expected at most 4194304 points in a clip" in done.stderr
 
 
@@ -121,7 +132,7 @@ def leaves(command):
 
 
 def test_no_option_takes_what_is_no_number():
-    checked = leaves(cli._refusing_nan(typer.main.get_command(cli.application())))
+    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
     numbers = [(leaf, one) for leaf in checked for one in leaf.params if "float" in str(one.type_descriptor.annotation)]
     assert len(numbers) > 60
     for leaf, one in numbers:
@@ -130,6 +141,17 @@ def test_no_option_takes_what_is_no_number():
         with pytest.raises((TypeError, UsageError)) as refused:  # where it is let through, the other words are missing
             leaf.callback(**{one.name: math.inf})
         assert ("inf: expected a finite number" in str(refused.value)) == (one.default != math.inf)
+
+
+def test_no_option_takes_a_count_of_a_thousand_millions():
+    """Seeds alone are no counts; settings have bounds of their own (test_settings_options.py)."""
+    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
+    counts = [(leaf, one) for leaf in checked for one in leaf.params if "int" in str(one.type_descriptor.annotation)]
+    counts = [(leaf, one) for leaf, one in counts if one.type_descriptor.parameter_info.parser is None]
+    assert len(counts) > 60
+    for leaf, one in counts:
+        with pytest.raises(UsageError, match=f"{one.opts[-1]} 1000000000: expected a whole number up to 10000000"):
+            leaf.callback(**{one.name: 10**9})
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):

@@ -72,7 +72,10 @@ def test_a_full_disk_keeps_what_is_done_and_the_same_command_continues(raw, tmp_
     done = namespace(script, D=str(tmp_path / "full"), RAW=str(raw))
     said, told = done.stdout.split("\n"), done.stderr
     assert said[:4] == ["code 1", ".out.h5.new", ".out.h5.part", "code 1"] and said[5:7] == ["code 0", "out.h5"], said
-    assert re.search(r"out.h5: no space left on the device; the [1-9]\d* samples done are kept. Make room", told), told
+    sizes = r"about \d+\.\d MB needed, \d+(\.\d)? \w+ of \d\.\d MB free in .*/full"
+    assert re.search(
+        rf"out.h5: no space left on the device \({sizes}\); the [1-9]\d* samples done are kept. Make room", told
+    ), told
     assert "continuing: " in told and "Traceback" not in told
     assert dpc("prepare", "msraction3d", raw, "-o", tmp_path / "whole.h5", "--jobs", "1", *more.split()).returncode == 0
     assert said[7].split()[0] == hashlib.sha256((tmp_path / "whole.h5").read_bytes()).hexdigest()
@@ -92,7 +95,8 @@ def test_a_disk_without_one_free_byte_is_told_in_the_same_words(words, tmp_path,
     )
     done = namespace(script, D=str(tmp_path), PYTHONPATH=str(ROOT))
     assert done.stdout.endswith("code 1\n"), done.stderr
-    assert re.fullmatch(r"dpc: error: full/\S+: no space left on the device; .*\n", done.stderr), done.stderr
+    told = r"dpc: error: full/\S+: no space left on the device \(0 bytes of 65.5 kB free in \S+/full\); .*\n"
+    assert re.fullmatch(told, done.stderr), done.stderr
 
 
 def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc, mounting):
@@ -116,7 +120,11 @@ def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(t
     )
     script = 'mount -t tmpfs -o size={} none "$D"; "$PYTHON" -c "$CODE"; echo "code $?"'
     env = {"D": str(tmp_path), "CODE": code, "PYTHON": sys.executable}
-    for size, said in (("1m", "flows_first.npy: no space left"), ("3m", "flows.npy: no space left"), ("9m", "written")):
+    for size, said in (
+        ("1m", "flows_first.npy: no space left"),
+        ("3m", "flows.npy: no space left on the device (about 2.0 MB needed, "),
+        ("9m", "written"),
+    ):
         done = namespace(script.format(size), **env)  # two files of 1.9 MiB
         assert said in done.stdout and done.stdout.endswith("code 0\n"), done.stdout + done.stderr
 
@@ -366,8 +374,8 @@ def shell(line: str, path: Path, **env: str) -> subprocess.CompletedProcess:
         ("DPC classify fuse F F.copy -o - --force >&-", 2, "-o -: standard output is closed"),
         ("DPC info - <&-", 2, "-: standard input is closed; pipe a command"),
         ("DPC evaluate report - --markdown <&-", 2, "-: standard input is closed; pipe a command"),
-        ("DPC evaluate classification <(cat F)", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
-        ("DPC prepare split <(cat F) -o x.h5", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
+        ("DPC evaluate classification <(cat F)", 3, "a FIFO, expected a regular file; to read from a pipe give `-`"),
+        ("DPC prepare split <(cat F) -o x.h5", 3, "a FIFO, expected a regular file; to read from a pipe give `-`"),
     ],
 )
 def test_closed_streams_and_pipes_in_the_place_of_files(named, line, code, said):

@@ -125,7 +125,7 @@ def test_recipes_of_gnu_parallel(folder, monkeypatch, capsys):
 
 def test_recipes_of_slurm_and_of_a_loop(folder, monkeypatch, capsys):
     """An array, its merge, the same in one line; and a plain loop: all the same file."""
-    script, merge, line, prediction = recipe("Slurm array")
+    script, merge, line, others = recipe("Slurm array")
     (folder / "job.sh").write_text(script)
     ways = ["sbatch job.sh\n" + merge, line + "\n" + merge, *recipe("A plain loop")]
     monkeypatch.chdir(folder)
@@ -142,8 +142,10 @@ def test_recipes_of_slurm_and_of_a_loop(folder, monkeypatch, capsys):
             assert list(reader.names) == ["v0", "v1", "v2"]
         made.append((folder / "ntu60.h5").read_bytes())
     assert made[0] == made[1] == made[2]
-    (one,) = noted(folder, prediction, SLURM_ARRAY_TASK_ID="1")
-    assert "--shard\x1f1/2" in one and "-o\x1fparts-1.h5" in one
+    lines = noted(folder, others, SLURM_ARRAY_TASK_ID="1")
+    assert all("--shard\x1f1/2" in one for one in lines)
+    outputs = [one.split("\x1f")[one.split("\x1f").index("-o") + 1] for one in lines]
+    assert outputs == ["scores-1.h5", "parts-1.h5", "flow-1.h5", "counts-1.h5", "scenes"]
 
 
 def test_a_job_that_was_stopped_is_put_back_into_the_queue(folder):

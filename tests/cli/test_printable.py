@@ -24,6 +24,7 @@ FORBIDDEN = ("\x1b[31mRED", "\x1b]0", "\x07", "\u202e", "\x9b", "\rdpc")
 COMMANDS = [
     "info C",
     "info C --json",
+    "info C --picture P.png --page P.html",
     "info S",
     "info EVIL",
     "info R/EVIL",

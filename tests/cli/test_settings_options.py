@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,6 +17,8 @@ from dpcli.cli.settings_options import options_of
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.value_types import is_tuple, write_text
+from tests.fuzz.fuzz_options import SETTINGS
 
 
 @dataclass(frozen=True)
@@ -228,3 +232,30 @@ def test_neither_torch_nor_numpy_is_loaded():
     code = "import sys, dpcli.cli.settings_options; sys.exit(bool({'torch', 'numpy', 'h5py'} & set(sys.modules)))"
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
+
+
+def test_settings_far_above_the_usual_are_named_where_memory_ends(tmp_path):
+    @options_of(CATALOG, ("lr",), presets=PRESETS, preset="quick")
+    def greedy(given: Given) -> None:
+        raise MemoryError("Unable to allocate 7.28 TiB for an array")
+
+    (tmp_path / "s.toml").write_text("frames = 500000\n")
+    words = {"config_file": tmp_path / "s.toml", "set_values": ["centroids=90000,512", "workers=1"], "lr": 0.1}
+    with pytest.raises(
+        UsageError, match=r"^frames = 500000, centroids = 90000,512, lr = 0.1: more memory would be needed"
+    ):
+        greedy(preset_name="quick", **words)
+    with pytest.raises(MemoryError):
+        greedy(preset_name="quick", config_file=None, set_values=["frames=8"], lr=None)
+
+
+@pytest.mark.parametrize("catalog", SETTINGS.values())
+def test_no_setting_takes_a_count_of_a_thousand_millions(catalog):
+    """A size of gigabytes is refused before anything is made of it."""
+    module, name = catalog
+    whole = [one for one in getattr(import_module(module), name).settings.values() if "int" in str(one.hint).lower()]
+    for one in whole:
+        for value in (10**9, 10**12):
+            text = write_text(one.default) if is_tuple(one.hint) and one.default else "0"
+            with pytest.raises(UsageError, match=f"^{one.name} = "):
+                one.parse(re.sub(r"\d+(?![.\d])", str(value), text))

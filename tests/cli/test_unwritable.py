@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dpcli.draw.animation import write_pictures
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.weights import find_weights
 from dpcli.runtime.whole_file import DiskFull
@@ -113,11 +113,13 @@ def test_an_input_that_is_not_there_is_bad_data_everywhere(folder, dpc, line):
     assert done.returncode == 3 and b"absent.h5: no such file" in done.stderr
 
 
-@pytest.mark.parametrize(("name", "said"), [("folder", "holds no trained model"), ("pipe", "not a regular file")])
+@pytest.mark.parametrize(
+    ("name", "said"), [("folder", "holds no trained model"), ("pipe", "a FIFO, expected a regular file")]
+)
 def test_what_is_there_and_no_model_is_not_called_missing(name, said, tmp_path):
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UsageError, match=f"{name}: {said}; give a .safetensors file"):
+    with pytest.raises(DataError, match=f"{name}: {said}; give a .safetensors file"):
         find_weights(tmp_path / name, None, "dpc classify train")
 
 

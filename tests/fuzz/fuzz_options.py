@@ -39,13 +39,19 @@ SETTINGS = {  # commands with settings -> where their catalog is
     "classify train": ("dpcli.classify.settings", "TRAINING"),
     "classify profile": ("dpcli.classify.settings", "NETWORK"),
     "classify explain pac": ("dpcli.classify.explain.pac_settings", "PAC"),
+    "segment train": ("dpcli.segment.training.settings", "CATALOG"),
+    "segment flow": ("dpcli.segment.flow.config", "CATALOG"),
+    "segment predict": ("dpcli.segment.prediction_settings", "CATALOG"),
+    "generate4d fit": ("dpcli.generate4d.config", "CATALOG"),
+    "generate4d render": ("dpcli.generate4d.render_settings", "CATALOG"),
+    "generate4d train-prior": ("dpcli.generate4d.shape.training.settings", "CATALOG"),
 }
 DATA = """
 prepare synthetic gestures -o gestures.h5 --videos-per-class 2 --subjects 2 --frames 18 --points 200
 prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
 classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
-segment predict objects.h5 -o parts.h5 --flow nearest --split all
+segment predict objects.h5 -o parts.h5 --fast --flow nearest --split all
 generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --set dense_steps=1 --set sparse_steps=1
 """
 COMMANDS = """
@@ -64,7 +70,7 @@ classify profile --preset tiny
 classify explain pac gestures.h5 --model model -o out/pac.h5
 classify explain tsne gestures.h5 --model model -o out/tsne.h5 --clips-per-video 1
 segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --set pairs_per_epoch=2
-segment predict objects.h5 -o out/parts.h5 --flow nearest
+segment predict objects.h5 -o out/parts.h5 --fast --flow nearest
 segment flow objects.h5 -o out/flow --steps 1 --batch 1
 segment estimate-flow objects.h5 -o out/ef.h5 --flow nearest
 segment profile

@@ -201,3 +201,16 @@ def test_other_counts_of_meshes_are_refused(kind, change, tmp_path):
     path.write_bytes(data.replace(*change, 1))
     with pytest.raises(DataError, match=f"a.{kind}: (damaged|truncated): its header counts"):
         shape_of(path)
+
+
+@pytest.mark.parametrize("behind", [b"\r\n", b"made by a program", bytes(100)])
+def test_bytes_behind_the_triangles_of_an_stl_are_passed_over_and_told(behind, tmp_path, capfd):
+    path, data = tmp_path / "a.stl", _mesh("stl")
+    path.write_bytes(data)
+    whole = shape_of(path)
+    path.write_bytes(data + behind)
+    np.testing.assert_array_equal(shape_of(path), whole)
+    assert f"a.stl: {len(behind)} bytes behind its 80 triangles were passed over" in capfd.readouterr().err
+    path.write_bytes(data + data[-50:])
+    with pytest.raises(DataError, match="damaged: its header counts 80 triangles, it holds 81"):
+        shape_of(path)

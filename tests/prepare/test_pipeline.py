@@ -245,7 +245,9 @@ def test_a_full_disk_is_explained_and_keeps_what_is_done(tmp_path, monkeypatch, 
         original(self, sequence)
 
     monkeypatch.setattr(CloudsWriter, "write", write)
-    with pytest.raises(DpcError, match="no space left on the device; the 2 samples done are kept") as error:
+    with pytest.raises(
+        DpcError, match=r"no space left on the device \(about .* needed, .* free in .*\); the 2 samples done are kept"
+    ) as error:
         convert(ToyReader(), tmp_path / "a.h5")
     assert error.value.exit_code == 1
     assert not (tmp_path / "a.h5").exists()

@@ -15,7 +15,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import _read_image
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.decode.color_frames import read_rgba
-from dpcli.prepare.decode.depth_files import read_image
+from dpcli.prepare.decode.depth_files import read_array, read_image
 from dpcli.prepare.decode.npz_frames import read_frames
 from dpcli.prepare.decode.safe_pickle import read_npz_member
 from dpcli.runtime.clips.animations import animation_times
@@ -139,7 +139,7 @@ import sys
 from pathlib import Path
 from dpcli.errors import DataError
 from dpcli.prepare.decode.color_frames import read_rgba
-from dpcli.prepare.decode.depth_files import read_image
+from dpcli.prepare.decode.depth_files import read_array, read_image
 from dpcli.prepare.decode.npz_frames import read_frames
 import cv2, PIL.Image
 
@@ -168,3 +168,32 @@ def test_none_of_them_takes_memory(tmp_path):
     ended = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout) < 100_000  # kilobytes; decoded, the smallest takes 170 MB
+
+
+@pytest.mark.parametrize(
+    "shape, kind", [((4,), "|V2000000000"), ((2**32, 2**32, 3), "<f4"), ((-4, 3), "<f4"), ((3, 3), "<f4")]
+)
+@pytest.mark.parametrize(
+    "read", [read_cloud, read_array, lambda path: read_npz_member(zipfile.ZipFile(path), path, "xyz")]
+)
+def test_an_array_in_an_archive_has_the_bytes_that_its_header_claims(read, shape, kind, tmp_path):
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    data = b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header + bytes(48)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("xyz.npy", data)
+    with pytest.raises(DataError, match=re.escape(f"claims shape {shape} of ") + "[0-9]+ bytes each and has 48 bytes"):
+        read(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("scale", [0.0, float("nan"), 1e300, -1e-300])
+def test_a_laser_scan_is_scaled_by_a_number_that_can_be(scale, tmp_path):
+    import laspy
+
+    las = laspy.create(point_format=0, file_version="1.2")
+    las.x, las.y, las.z = np.random.default_rng(0).random((3, 20))
+    las.write(str(tmp_path / "a.las"))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[139:147] = struct.pack("<d", scale)
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(DataError, match="its header scales y by"):
+        read_cloud(tmp_path / "a.las")

@@ -45,6 +45,14 @@ def test_what_belongs_to_a_clip(names, frames, left_out):
     [
         ["cup_0.ply", "cup_1.ply", "bowl_0.ply", "bowl_1.ply"],
         ["cup1_0.ply", "cup1_1.ply", "cup2_0.ply", "cup2_1.ply"],
+        ["cam1_100.ply", "cam1_105.ply", "cam1_111.ply", "cam2_100.ply", "cam2_105.ply", "cam2_111.ply"],
+        [
+            "20240101_100000_cam0.ply",
+            "20240101_100001_cam0.ply",
+            "20240101_100000_cam1.ply",
+            "20240101_100001_cam1.ply",
+        ],
+        ["1700000000000_1.bin", "1700000000100_1.bin", "1700000000000_2.bin", "1700000000090_2.bin"],
         ["left-3.bin", "left-4.bin", "right-3.bin", "right-4.bin", "right-5.bin"],
     ],
 )
@@ -81,6 +89,7 @@ def test_nothing_but_texts_about_frames_is_no_clip():
         (["28.02.2024 10.00.00.ply", "13.03.2024 10.00.00.ply"], [0, 1209600]),
         (["02-28-2024 10.00.00.ply", "03-13-2024 10.00.00.ply"], [0, 1209600]),
         (["01-02-2024_10-00-00.ply", "02-02-2024_10-00-00.ply"], None),
+        (["20241027T025959.5+0200.ply", "20241027T020000+0100.ply", "20241027T020001+0100.ply"], [0, 0.5, 1.5]),
         (["20221107_195059.ply", "20221107_195100.ply", "20221107_195101.ply"], [0, 1, 2]),
         (["1305031102.175304.png", "1305031102.211214.png"], [0, 0.03591]),
         (["1305031102_175304000.png", "1305031102_211214000.png"], [0, 0.03591]),
@@ -93,6 +102,8 @@ def test_nothing_but_texts_about_frames_is_no_clip():
         (["v1.2.ply", "v1.9.ply", "v1.10.ply"], None),
         (["frame_1.ply", "frame_2.ply", "frame_10.ply"], None),
         (["1234567890_000001.ply", "1234567890_000002.ply"], None),
+        (["10-00.ply", "10-30.ply", "11-00.ply", "11-30.ply"], None),
+        (["1305031102-100000.ply", "1305031102-200000.ply", "1305031103-100000.ply", "1305031103-200000.ply"], None),
     ],
 )
 def test_order_and_times_that_names_tell(names, times):
@@ -121,6 +132,8 @@ def test_gaps_stay_gaps_in_time_and_are_named():
     np.testing.assert_allclose(series.frame_times(10), [0, 0.1, 0.2, 0.7, 0.8])
     assert series.frame_times(None) is None
     assert missing_numbers(series.numbers()) == ["3 to 6"]
+    both = chosen("0000001-000000033369.bin", "0000002-000000066738.bin", "0000004-000000133476.bin")
+    np.testing.assert_allclose(both.frame_times(10), [0, 0.1, 0.3])
     assert about_series([("a", series)]) == ["a: its frames are numbered with gaps: 3 to 6 missing"]
     np.testing.assert_allclose(chosen("10.bin", "15.bin", "20.bin", "30.bin").frame_times(5), [0, 0.2, 0.4, 0.8])
 

@@ -168,7 +168,7 @@ def test_a_model_of_a_run_without_weights_yet(data, finished, tmp_path, dpc_here
     )
     (finished / "last.safetensors").unlink()
     none = dpc_here(*words)
-    assert none.returncode == 2 and b"no best.safetensors yet" in none.stderr and b"to continue it" in none.stderr
+    assert none.returncode == 3 and b"no best.safetensors yet" in none.stderr and b"to continue it" in none.stderr
 
 
 def test_a_finished_training_says_so(data, finished, dpc_here):

@@ -124,10 +124,7 @@ def test_set_reads_every_type():
         ("batch=1.5", "batch = 1.5: expected a whole number"),
         ("batch=", "batch = '': expected a whole number"),
         ("batch=true", "batch = true: expected a whole number"),
-        (
-            "batch=99999999999999999999",
-            "batch = 99999999999999999999: expected a whole number up to 9223372036854775807",
-        ),
+        ("batch=99999999999999999999", "batch = 99999999999999999999: expected a whole number up to 1000000"),
         ("lr=0", "lr = 0: expected a number above 0"),
         ("lr=nan", "lr = nan: expected a number above 0"),
         ("lr=inf", "lr = inf: expected a finite number below 1e+30"),
@@ -318,7 +315,7 @@ def legal(hint: Any, low: float, high: float) -> st.SearchStrategy:
         return st.lists(items[0], max_size=4).map(tuple) if get_args(hint)[-1] is ... else st.tuples(*items)
     simple = {
         bool: st.booleans(),
-        int: st.integers(int(max(low, -(2**63) + 1)), int(min(high, 2**63 - 1))),
+        int: st.integers(int(max(low, -(10**6))), int(min(high, 10**6))),
         float: st.floats(low, high),
         str: st.text(st.characters(exclude_categories=["Cs"])),
     }

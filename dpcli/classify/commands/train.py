@@ -15,7 +15,7 @@ from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
-from dpcli.classify.data.likeness import file_like, tell_rounded
+from dpcli.classify.data.likeness import file_like, tell_rounded, tell_unlike
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     about_classes,
@@ -32,6 +32,7 @@ from dpcli.classify.network.model_file import ModelInfo, find_model, load_model,
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.fine_tune import resolved, settings_from
+from dpcli.classify.training.first_weights import take_weights
 from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
@@ -137,7 +138,7 @@ def _train(
     report_short(videos.training, settings.network.num_frames)
     report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
-    model = _new_model(settings, folder).to(device)
+    model = _new_model(settings, videos, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
     _announce(device, processes, videos, settings)
     keep_freed_memory()
@@ -292,41 +293,28 @@ def check_shares(clips: int, schedule: Schedule, processes: int) -> None:
         )
 
 
-def _new_model(settings: TrainingSettings, folder: RunFolder) -> Kinet:
+def _new_model(settings: TrainingSettings, videos: _Videos, folder: RunFolder) -> Kinet:
     """Returns a fresh network, or one that starts from a trained one's static stream or from all of it, as far as shapes
-    agree."""
+    and class names agree."""
     config, run = settings.network, settings.run
     model = Kinet(config)
-    for name, option, mine in ((run.static_from, "static_from =", model.static), (run.init, "--init", model)):
+    for name, option, alone in ((run.static_from, "static_from =", True), (run.init, "--init", False)):
         if not name:
             continue
         weights = find_model(name, option)
         folder.refuse_inside(option, weights)
-        other, _ = load_model(weights, config.backbone)
-        theirs = other.static if mine is model.static else other
-        _copy_fitting(mine, theirs, f"{option} {name}")
+        other, info = load_model(weights, config.backbone)
+        mine, theirs = (model.static, other.static) if alone else (model, other)
+        take_weights(mine, theirs, videos.class_names, info.class_names, f"{option} {name}")
+        if not alone:
+            looks = videos.looks | {"step": 0.0}  # that coordinates are rounded was told when they were read
+            tell_unlike(str(videos.training.reader.path), looks, replace(info, config=config), name)
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
             log.warn(
                 f"{option} {name}: its static stream learned from neighbors up to {other.config.static_radius} frames away, here"
                 f" {config.static_radius}; --set static_temporal_radius={other.config.static_radius} goes on as it was"
             )
     return model
-
-
-def _copy_fitting(mine: torch.nn.Module, theirs: torch.nn.Module, what: str) -> None:
-    """Copies the weights whose names and shapes agree. Raises UsageError when those are fewer than half."""
-    own, others = mine.state_dict(), theirs.state_dict()
-    fitting = {key: value for key, value in others.items() if key in own and value.shape == own[key].shape}
-    left = sorted(set(own) - set(fitting))
-    weights = [key for key in own if own[key].dim() > 1]
-    if 2 * sum(key in fitting for key in weights) < len(weights):
-        key = next((key for key in weights if key not in fitting), "?")
-        shape = tuple(others[key].shape) if key in others else "absent"
-        raise UsageError(
-            f"{what}: another network ({key}: {shape}, here {tuple(own[key].shape)}); give the same --preset and backbone"
-        )
-    mine.load_state_dict({**own, **fitting})
-    log.info(f"{what}: {len(fitting)} of {len(own)} tensors taken" + (f"; fresh: {', '.join(left)}" if left else ""))
 
 
 def _announce(device: torch.device, processes: Processes, videos: _Videos, settings: TrainingSettings) -> None:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import WIDEST, check, setting
 from dpcli.runtime.settings.stored import from_json
 
 CROSS = "cross"  # the rule of validation by which every video is judged by members that never saw it
@@ -68,12 +68,15 @@ class KinetConfig:
         "Neighbors taken within the radius: the first found, the nearest, or equal shares of each frame (balanced).",
     )
     widths: tuple[tuple[int, ...], ...] = setting(
-        ((64, 128), (128, 256), (512, 1024)), "Widths of the backbone's layers, a group for each stage.", least=1
+        ((64, 128), (128, 256), (512, 1024)),
+        "Widths of the backbone's layers, a group for each stage.",
+        least=1,
+        most=WIDEST,
     )
     head: tuple[int, int] | None = setting(
-        None, "Widths of the dynamic branch's head; none: the last group of widths.", least=1
+        None, "Widths of the dynamic branch's head; none: the last group of widths.", least=1, most=WIDEST
     )
-    group_size: int = setting(4, "Features per fitted surface, d of eq. 3.5.", least=1)
+    group_size: int = setting(4, "Features per fitted surface, d of eq. 3.5.", least=1, most=WIDEST)
     reduction: float = setting(
         0.5, "Width of the fitted features as a share of the static layer's width.", above=0, most=1
     )

@@ -64,7 +64,7 @@ class NeighborCache:
                 reserve(file.fileno(), size)
                 return np.memmap(file, record, "r+", shape=(len(self._known),))
         except OSError as error:
-            raise disk_full(self.folder, error) or error from None
+            raise disk_full(self.folder, error, needed=size) or error from None
 
     def _read(self, numbers: np.ndarray, cloud: tuple[Tensor, Tensor]) -> list[Grouping]:
         records = self._records[numbers]

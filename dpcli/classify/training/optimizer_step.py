@@ -138,12 +138,14 @@ def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -
 
 
 def _new_optimizer(branch: nn.Module, schedule: Schedule) -> torch.optim.Optimizer:
-    # The last layer sums a thousand pooled maxima, all positive: at the others' rate its first steps overshoot.
+    # The last layer sums a thousand pooled maxima, all positive: at the others' rate its first steps overshoot. Where only a
+    # head learns, these maxima are sound from the start, and steps are few.
+    slower = 0.1 if schedule.fine_tune == "all" else 1.0
     named = {name: one for name, one in branch.named_parameters() if one.requires_grad}
     last = [p for name, p in named.items() if name.startswith("head.classify")]
     rest = [p for name, p in named.items() if not name.startswith("head.classify")]
     groups = [
-        {"params": last, "weight_decay": schedule.weight_decay, "share": 0.1 if rest else 1.0},
+        {"params": last, "weight_decay": schedule.weight_decay, "share": slower},
         {"params": [p for p in rest if p.dim() > 1], "weight_decay": schedule.weight_decay, "share": 1.0},
         {"params": [p for p in rest if p.dim() <= 1], "weight_decay": 0.0, "share": 1.0},
     ]

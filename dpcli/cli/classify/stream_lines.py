@@ -28,7 +28,10 @@ class Lines:
         """Prints nothing of a frame."""
 
     def write(self, made: Prediction, latency: float, waiting: int) -> None:
-        """Prints one prediction. Its latency runs from the arrival of its last frame, waiting behind earlier ones included."""
+        """Prints one prediction. Its latency runs from the arrival of its last frame, waiting behind earlier ones included.
+
+        People read confidence, what the threshold is held against; plain probabilities are in the JSON beside it.
+        """
         seconds = latency
         sure, nothing = self._sure(made.scores[0])
         self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
@@ -46,11 +49,10 @@ class Lines:
             }
             print(json.dumps(row), flush=True)
             return
-        behind = f", {waiting} frames waiting" if waiting else ""
+        behind = f", {waiting} frame{'' if waiting == 1 else 's'} waiting" if waiting else ""
         said = f"{NOTHING}; best " if nothing else ""
         print(
-            f"frame {made.frame}: {said}{self._text(made.scores)}; so far {self._name(made.mean[0])}; "
-            f"{latency:.0f} ms{behind}",
+            f"frame {made.frame}: {said}{self._text(self.confidence.of(made.scores))}; {latency:.0f} ms{behind}",
             flush=True,
         )
 
@@ -71,7 +73,7 @@ class Lines:
             return
         plural = "" if clips == 1 else "s"
         print(
-            f"{end}: {frames} frames, {clips} clip{plural}: {self._text(mean)}; "
+            f"{end}: {frames} frames, {clips} clip{plural}: mean {self._text(mean)}; "
             f"latency {average:.0f} ms on average, at most {highest:.0f}",
             flush=True,
         )

@@ -66,7 +66,7 @@ class View:
         if self.newest is None:
             return Panel(Text(f"the window of {self.speaker.window} frames is not full yet"), title=told, width=72)
         probabilities, latency, waiting = self.newest
-        behind = f", {waiting} frames waiting" if waiting else ""
+        behind = f", {waiting} frame{'' if waiting == 1 else 's'} waiting" if waiting else ""
         foot = Text(f"latency {1000 * latency:.0f} ms{behind}", style="dim")
         return Panel(Group(self._headline(), *self._bars(probabilities), self._strip(), foot), title=told, width=72)
 

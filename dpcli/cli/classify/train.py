@@ -39,7 +39,11 @@ def train(
     if result is None:  # not the first of several processes
         return
     typer.echo(result.weights)
-    if result.accuracy:
+    if not result.accuracy:
+        typer.echo(
+            "no video was held out to judge it: `dpc classify predict` and `dpc evaluate classification` on others do"
+        )
+    else:
         scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in result.accuracy.items())
         typer.echo(f"{result.videos} validation videos: {scores}")
         if result.forest is not None:

@@ -85,7 +85,12 @@ class IntervalOptions:
     confidence: Confidence = 0.95
     resamples: Annotated[
         int,
-        typer.Option("--resamples", min=0, help="Bootstrap resamples for the intervals, 100 or more; 0: no intervals."),
+        typer.Option(
+            "--resamples",
+            min=0,
+            max=1_000_000,
+            help="Bootstrap resamples for the intervals, 100 or more; 0: no intervals.",
+        ),
     ] = 2000
     seed: Seed = 0
 

@@ -31,7 +31,7 @@ class ArticulationOptions:
     """Holds the options that say how an articulated object moves and how it is seen."""
 
     HEADING: ClassVar = "Motion and view"
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames per sequence.")] = 4
+    frames: Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Frames per sequence.")] = 4
     view: Annotated[
         Literal["full", "single"],
         typer.Option("--view", help="full: the whole surface. single: what one camera sees of it."),

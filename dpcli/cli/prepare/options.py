@@ -69,7 +69,11 @@ CategoryFractions = Annotated[
 SequencesPerObject = Annotated[
     int,
     typer.Option(
-        "--pairs-per-object", "--sequences-per-object", min=1, help="Sequences of --frames drawn of each object."
+        "--pairs-per-object",
+        "--sequences-per-object",
+        min=1,
+        max=100_000,
+        help="Sequences of --frames drawn of each object.",
     ),
 ]
 Protocol = Annotated[
@@ -93,7 +97,7 @@ PictureSize = Annotated[int, typer.Option("--size", min=16, max=4096, help="Side
 FramesAtMost = Annotated[
     int, typer.Option("--frames", min=0, help="At most this many frames, evenly sampled; 0 keeps all.")
 ]
-ClipFrames = Annotated[int, typer.Option("--frames", min=1, help="Frames, evenly spaced over the clip.")]
+ClipFrames = Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Frames, evenly spaced over the clip.")]
 Border = Annotated[
     float, typer.Option("--border", help="Share of the picture left empty along the object's longer side.")
 ]

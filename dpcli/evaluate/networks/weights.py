@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, UsageError
+from dpcli.regular_files import why_unreadable
 from dpcli.text_files import read_toml
 
 LIST = Path(__file__).with_name("weights.toml")
@@ -81,11 +82,12 @@ def weights_named(name: str) -> Weights:
 def weights_folder(given: Path | None = None) -> Path:
     """Returns the folder of weights: the one given, else that of DPC_WEIGHTS, else `dpc/weights` in the user's cache.
 
-    It need not exist, unless it was given: UsageError.
+    It need not exist, unless it was given: DataError.
     """
     if given is not None:
         if not given.is_dir():
-            raise UsageError(f"--weights {given}: no such folder")
+            what = why_unreadable(given) or ("a file, expected a folder" if given.exists() else "no such folder")
+            raise DataError(f"--weights {given}: {what}")
         return given
     if os.environ.get(FOLDER_VARIABLE):
         return Path(os.environ[FOLDER_VARIABLE]).expanduser()

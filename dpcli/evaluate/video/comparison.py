@@ -24,6 +24,7 @@ from dpcli.evaluate.video.sources.open_source import open_source
 from dpcli.evaluate.video.sources.source import Source
 from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.evaluate.video.view_pairing import match_views
+from dpcli.runtime.progress import log
 
 NO_INTERVALS = Resampling(0)
 ROLES = ("reference", "test", "train")
@@ -129,9 +130,12 @@ def _learned_scores(
     frames: FramePass, names: Sequence[str], weights: Path | None, device: str
 ) -> tuple[dict[str, LearnedScore], dict[str, str]]:
     """Returns the scores of the learned metrics, and why others have none: a pass of its own, frames in order."""
+    folder = weights_folder(weights)
+    if weights is not None and not set(names) - {"warping"}:
+        log.warn(f"--weights {weights}: nothing in it is read; none of the metrics asked for needs a network")
     if not names:
         return {}, {}
-    made, missing = load_metrics(names, frames.protocol.networks, weights_folder(weights), device)
+    made, missing = load_metrics(names, frames.protocol.networks, folder, device)
     others = replace(frames.protocol, views=frames.protocol.learned_views or frames.protocol.views)
     second = replace(frames, left_out=[])
     if made:

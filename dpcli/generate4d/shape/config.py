@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import WIDEST, check, setting
 from dpcli.runtime.settings.stored import from_json
 
 
@@ -14,10 +14,13 @@ class ShapeConfig:
     """Holds the sizes of a shape network."""
 
     widths: tuple[int, ...] = setting(
-        (24, 64, 128, 192), "Channels of the levels; the first works at half of the pictures' size.", least=1
+        (24, 64, 128, 192),
+        "Channels of the levels; the first works at half of the pictures' size.",
+        least=1,
+        most=WIDEST,
     )
-    hidden: int = setting(128, "Width of the layers that name the angles.", least=1)
-    bins: int = setting(15, "Bins of each angle.", least=2)
+    hidden: int = setting(128, "Width of the layers that name the angles.", least=1, most=WIDEST)
+    bins: int = setting(15, "Bins of each angle.", least=2, most=360)
 
     def __post_init__(self) -> None:
         check(self)

@@ -6,11 +6,12 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from os.path import splitext
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from dpcli.prepare.actions.depth_units import (
     usual_scale,
     without_marks,
 )
-from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.decode.depth_files import (
     ARRAY_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -32,13 +32,16 @@ from dpcli.prepare.decode.depth_files import (
     read_depth_video,
     says_depth,
 )
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
-from dpcli.prepare.recordings.depth import read_recorded_depth
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
+
+if TYPE_CHECKING:
+    from dpcli.prepare.decode.calibration import Calibration
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
@@ -196,6 +199,8 @@ class DepthVideos:
         """Returns the frames of an item, and the camera that a recording describes."""
         if not item.extra["recording"]:
             return read_depth_video(item.path, self.stride, item.extra["series"]), None
+        from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
+
         read, camera = read_recorded_depth(item.path, self.topic, self.stride)
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
 
@@ -309,12 +314,14 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     suffixes = (*VIDEO_SUFFIXES, *ARRAY_SUFFIXES)
     found += [(recording, None) for recording in find_recordings(path)]
     clips = {os.fspath(recording) for recording, _ in found}
-    for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
-        folders[:] = [name for name in folders if not is_hidden(name)]
+    for folder, folders, files in walk_folders(
+        path
+    ):  # frames are many: they are neither sorted nor asked what they are
         for name in folders:
-            if series := frame_series(Path(folder, name), pattern):
-                found.append((Path(folder, name), series))
-                clips.add(os.path.join(folder, name))
+            with suppress(PermissionError):  # it is told as skipped
+                if series := frame_series(Path(folder, name), pattern):
+                    found.append((Path(folder, name), series))
+                    clips.add(os.path.join(folder, name))
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))
@@ -322,7 +329,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        below = (name.lower() for _, _, files in os.walk(path) for name in files if not is_hidden(name))
+        below = (name.lower() for _, _, files in walk_folders(path) for name in files if not is_hidden(name))
         others = Counter(splitext(name)[1] for name in below if name.endswith(_FOREIGN))
         seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
         raise DataError(

@@ -16,6 +16,7 @@ _SAMPLED = 4096
 _ROUGH, _SMOOTHER = 0.01, 8.0  # how much neighbors differ, as a share of the mean; how much less with bytes swapped
 _STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per meter, of a sensor's millimeters
 _SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
+_MARKED, _WELL_BELOW = 0.005, 0.97  # share of pixels that hold a mark; up to where the others reach then
 _ROWS = 16  # of a frame that are looked at
 
 
@@ -62,7 +63,7 @@ def require_byte_order(name: str, frames: np.ndarray) -> None:
     frame = frames[len(frames) // 2]
     some = frame[:: max(1, len(frame) // _ROWS)]
     rough = _roughness(some)
-    if rough > _ROUGH and rough > _SMOOTHER * _roughness(some.byteswap()) and len(np.unique(some)) > _KINDS:
+    if rough > _ROUGH and rough > _SMOOTHER * _roughness(some.byteswap()) and _kinds(some) > _KINDS:
         raise DataError(
             f"{name}: its depths leap from pixel to pixel, as where the two bytes of each are the wrong way round; write"
             " them again in the byte order that the format prescribes, such as by NumPy's byteswap"
@@ -78,14 +79,17 @@ def _roughness(rows: np.ndarray) -> float:
 
 def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
-    in millimeters; the low bits of 8 may hold flags.
+    in millimeters; the low bits of 8 may hold flags. Another one where the largest number of 10 to 15 bits seems to be a mark.
     """
     if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
         return {}
     flat = frames[len(frames) // 2].reshape(-1)
     some = flat[:: max(1, len(flat) // _SAMPLED)].astype(np.int64)
     some = some[some > 0]
-    if len(np.unique(some)) <= _KINDS:
+    if mark := _full_bits(some):
+        what = f"videos in which many pixels hold {mark}, the largest number of {mark.bit_length()} bits, and none a little less"
+        return {f"{what}: a mark of nothing seen? --far leaves them out": 1}
+    if _kinds(some) <= _KINDS:
         return {}
     for step, scale in _STEPS.items():
         alike, coarser = (np.bincount(some % own).max() > _SAME_REST * len(some) for own in (step, 2 * step))
@@ -93,6 +97,24 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
             what = f"videos whose raw depths go in steps of {step}"
             return {f"{what}; if their sensor counted millimeters, give --depth-scale {scale}": 1}
     return {}
+
+
+def _kinds(values: np.ndarray) -> int:
+    """Returns how many different numbers there are; `np.unique` loads masked arrays first, for which every process would wait."""
+    ordered = np.sort(values, axis=None)
+    return np.count_nonzero(ordered[1:] != ordered[:-1]) + min(len(ordered), 1)
+
+
+def _full_bits(values: np.ndarray) -> int:
+    """Returns the largest of some raw depths, i64 (N), if it is all that 10 to 15 bits can hold, several have it, and the
+    others end well below; else 0.
+    """
+    most = int(values.max(initial=0))
+    if most + 1 not in [1 << bits for bits in range(10, 16)]:
+        return 0
+    others = values[values < most]
+    several = len(values) - len(others) > _MARKED * len(values)
+    return most if several and int(others.max(initial=0)) < _WELL_BELOW * most else 0
 
 
 def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: bool) -> None:

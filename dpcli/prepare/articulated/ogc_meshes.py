@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
-from dpcli.prepare.decode.mesh_counts import mesh_source, require_counts
+from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
+from dpcli.prepare.meshes.mesh_files import load_mesh
 from dpcli.prepare.reader import natural_key, require_folder
 
 
@@ -46,15 +46,11 @@ def load_shape(path: Path, up: str) -> Shape:
 
     Raises DataError when it has no surface.
     """
-    import trimesh
-
-    require_counts(path)
     try:
-        options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(
-            **mesh_source(path), force="mesh", process=False, resolver=files_inside(path, path.parent), **options
-        )
+        mesh = load_mesh(path, path.parent)
         triangles = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces, np.int64)]
+    except DataError:
+        raise
     except Exception as error:  # the readers of eight formats raise many kinds on damaged files
         raise DataError(f"{path}: not a readable mesh ({type(error).__name__}: {error})") from None
     triangles = triangles.reshape(-1, 3, 3)

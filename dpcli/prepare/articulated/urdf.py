@@ -15,6 +15,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, drop_degenerate, joint_motion
 from dpcli.prepare.articulated.urdf_meshes import geometry_triangles, resolve
+from dpcli.runtime.clips.other_files import refuse_wrapped
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
@@ -22,6 +23,19 @@ _TURNS = "hinges with limits more than two turns apart (one turn taken; are they
 _EQUAL = "joints whose two limits are equal taken as fixed (as SolidWorks exports joints without limits)"
 
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
+_READ = {  # elements, and which of those within them count
+    "robot": ("link", "joint"),
+    "link": ("visual", "collision"),
+    "visual": ("origin", "geometry"),
+    "collision": ("origin", "geometry"),
+    "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
+}
+_COUNTS = {  # texts of numbers, and how many
+    **dict.fromkeys([("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz"), ("box", "size")], (3,)),
+    **dict.fromkeys([("limit", "lower"), ("limit", "upper"), ("mimic", "multiplier"), ("mimic", "offset")], (1,)),
+    **{(shape, name): (1,) for shape in ("cylinder", "capsule", "sphere") for name in ("radius", "length")},
+    ("mesh", "scale"): (1, 3),
+}
 _XACRO = "it is written in xacro; make a plain URDF of it first: xacro FILE > robot.urdf"
 
 
@@ -92,6 +106,7 @@ def _parse(path: Path) -> Any:
     logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
     utf8_path(path, "yourdfpy")
     try:
+        refuse_wrapped(path)
         text = path.read_bytes().lstrip(b" \t\r\n")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
@@ -116,14 +131,16 @@ def _parse(path: Path) -> Any:
 
 
 def _make_plain(path: Path, tree: Any) -> None:
-    """Takes namespaces out of the elements' names, and removes collision shapes of unknown kinds."""
+    """Takes namespaces out of the elements' names, and removes what is not read: other elements, collision shapes where there
+    are visual ones, and those of unknown kinds.
+    """
     from lxml import etree
 
     document, root = tree.docinfo.internalDTD, tree.getroot()
     if document is not None and any(True for _ in document.iterentities()):
         raise DataError(f"{path}: it has a DOCTYPE, whose entities are not read; expected a plain URDF")
     elements = [element for element in root.iter() if isinstance(element.tag, str)]
-    if any(element.prefix == "xacro" or any("${" in v or "$(" in v for v in element.values()) for element in elements):
+    if any(element.prefix == "xacro" for element in elements):
         raise DataError(f"{path}: {_XACRO}")
     for element in elements:
         if element.prefix is None:
@@ -131,6 +148,9 @@ def _make_plain(path: Path, tree: Any) -> None:
     etree.cleanup_namespaces(tree)
     if root.tag != "robot":
         raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
+    _remove_unread(root)
+    if any("${" in value or "$(" in value for element in root.iter() for value in element.values()):
+        raise DataError(f"{path}: {_XACRO}")
     root.set("name", root.get("name", "robot"))  # nothing here depends on it
     for origin in root.iter("origin"):
         if origin.get("quat_xyzw"):
@@ -150,6 +170,46 @@ def _make_plain(path: Path, tree: Any) -> None:
         kinds = [part.tag for part in shape.findall("geometry/*") if isinstance(part.tag, str)]
         if not kinds or not {*kinds} <= {*_SHAPES}:
             shape.getparent().remove(shape)
+    _check_texts(path, root)
+
+
+def _remove_unread(root: Any) -> None:
+    """Removes what nothing here depends on, so that it may be as odd as it likes: masses, materials, motors, simulators."""
+    drawn = root.find("link/visual/geometry/*") is not None
+    for element in [element for element in root.iter() if element.tag in _READ]:
+        for inner in list(element):
+            if isinstance(inner.tag, str) and (
+                inner.tag not in _READ[element.tag] or drawn and inner.tag == "collision"
+            ):
+                element.remove(inner)
+    for limit in root.iter("limit"):
+        for name in {*limit.attrib} - {"lower", "upper"}:
+            del limit.attrib[name]
+
+
+def _check_texts(path: Path, root: Any) -> None:
+    """Raises DataError that names link or joint at a text that isn't the numbers it should be; an empty one is none."""
+    for element in root.iter(*{tag for tag, _ in _COUNTS}):
+        for name, text in element.items():
+            expected = _COUNTS.get((element.tag, name))
+            if not expected:
+                continue
+            if not text.strip():
+                del element.attrib[name]
+            elif len(text.split()) not in expected or not all(map(_is_number, text.split())):
+                owner = next(one for one in element.iterancestors() if one.tag in ("link", "joint", "robot"))
+                raise DataError(
+                    f"{path}: {owner.tag} {owner.get('name')!r}: {name}={text!r} of <{element.tag}>; expected "
+                    f"{' or '.join(map(str, expected))} {'number' if expected == (1,) else 'numbers'}, with spaces between"
+                )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _roll_pitch_yaw(path: Path, text: str) -> list[float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
-from dpcli.prepare.decode.mesh_counts import mesh_source, require_counts
+from dpcli.prepare.meshes.mesh_files import load_mesh
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 _PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
@@ -62,6 +62,7 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
     name = name.replace("\\", "/")  # written on Windows
     in_package = name.startswith(_PACKAGES)
     plain = name.split("://", 1)[1] if in_package else name
+    plain = plain.lstrip("/") if in_package else plain  # package:///part.stl, of a package without a name
     tails = [plain, plain.split("/", 1)[1]] if in_package and "/" in plain else [plain]
     tails += [unquote(tail) for tail in tails if "%" in tail]
     folders = [path.parent]
@@ -87,40 +88,20 @@ def _joined(path: Path, root: Path | None, folder: Path, name: str) -> Path:
 
 
 def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
-    import trimesh
-
     file = resolve(path, name, root)
     if not file.is_file():
         raise DataError(f"{path}: its mesh {is_missing(path, name, root)}")
     if file.suffix.lower() not in MESH_FORMATS:
         raise DataError(f"{path}: its mesh {name} is of an unknown format; expected one of {' '.join(MESH_FORMATS)}")
     try:
-        require_counts(file)
-    except DataError as error:
-        raise DataError(f"{path}: its mesh {error}") from None
-    try:
-        options = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(
-            **mesh_source(file), force="mesh", process=False, resolver=files_inside(file, root), **options
-        )
+        mesh = load_mesh(file, root)
         if mesh.vertices.shape[1:] != (3,):
             raise ValueError(f"its vertices have {mesh.vertices.shape[1]} coordinates, expected 3")
-        if len(mesh.faces) and mesh.faces.max() >= len(mesh.vertices):
-            raise ValueError("a face names a vertex that is not there")
         return mesh
+    except DataError as error:
+        raise DataError(f"{path}: its mesh {error}") from None
     except Exception as error:  # the readers of eight formats raise many kinds on damaged files
         raise DataError(f"{path}: its mesh {name} cannot be read ({type(error).__name__}: {error})") from None
-
-
-def files_inside(file: Path, root: Path | None) -> Any:
-    """Returns what trimesh asks for the buffers and pictures of a mesh: files inside ``root`` alone (None: any)."""
-    from trimesh.resolvers import FilePathResolver
-
-    class _Inside(FilePathResolver):
-        def get(self, name: str) -> bytes:
-            return path_inside(root, file.parent, name.strip()).read_bytes()
-
-    return _Inside(str(file))
 
 
 def _meters(path: Path, mesh: Any, name: str, notes: Counter) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy, require_room
+from dpcli.npy_files import map_npy, read_arrays
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -23,6 +23,7 @@ _COLOR_KEYS = ("color", "colors", "rgb")
 _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
 _TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
+_SAMPLED, _SURELY_APART = 4096, 0.4  # values of an axis that are looked at; nats a value that leave no doubt
 _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
 
 
@@ -33,15 +34,7 @@ def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
-            arrays = {key: archive[key] for key in archive.files}
-            arrays = {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # or bare bytes
-    except DataError:
-        raise
-    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
-        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    arrays = read_arrays(path)
     key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
     if key is None and {"x", "y", "z"} <= arrays.keys():
         return cloud_of_columns(path, {k: a for k, a in arrays.items() if a.shape == arrays["x"].shape}, keep)
@@ -117,7 +110,8 @@ def guess_bin_columns(paths: Sequence[Path]) -> tuple[int, bool]:
     """Returns how many float32 a point of some ``.bin`` files of one sequence has, and whether the numbers leave no doubt.
 
     In the right number of columns each holds values of one kind: little spread within, more between. Where that decides
-    nothing, 4 (x y z reflectance, as KITTI has it) needs a fourth column without negative values; else it is 3.
+    nothing, 4 (x y z reflectance, as KITTI has it) needs a fourth column without negative values; else it is 3. Raises
+    DataError where the numbers lie axis after axis.
     """
     sizes = [path.stat().st_size for path in paths]
     possible = [c for c in _COLUMNS if all(size % (4 * c) == 0 for size in sizes)]
@@ -125,11 +119,35 @@ def guess_bin_columns(paths: Sequence[Path]) -> tuple[int, bool]:
         return 4, True  # reading says what is wrong
     with np.errstate(invalid="ignore"):  # bytes of another type may be no numbers; reading says so
         values = [np.fromfile(path, "<f4", _FLOATS).astype(np.float64) for path in paths]
+    _refuse_axes_apart(paths[0], possible, values[0])
     near = _likely(values, possible)
     if 4 in near and all(_is_reflectance(one[: len(one) // 4 * 4].reshape(-1, 4)[:, 3]) for one in values):
         return 4, True
     chosen = min(c for c in near if c != 4 or near == [4])
     return chosen, len(near) == 1
+
+
+def _refuse_axes_apart(path: Path, possible: Sequence[int], head: np.ndarray) -> None:
+    """Raises DataError where the numbers of a ``.bin`` are told much better as all x, then all y, and so on (RobotCar).
+
+    head: those at its beginning, f64.
+    """
+    if len(head) < _TELLING or not np.abs(head).max() < _LARGEST:  # reading says that these are no coordinates
+        return
+    values = np.memmap(path, "<f4", "r")
+    apart = {}
+    for count in possible:
+        parts = values.reshape(count, -1)
+        some = parts[:, :: max(1, parts.shape[1] // _SAMPLED)]
+        with np.errstate(invalid="ignore"):
+            apart[count] = _cost(some.T.astype(np.float64).ravel(), count)
+    least = min(_cost(head, count) for count in possible) - _SURELY_APART
+    fitting = [count for count in apart if apart[count] < least]
+    if fitting:
+        raise DataError(
+            f"{path}: its numbers seem to lie axis after axis, all x first; expected point after point: save them as"
+            f" numpy.fromfile(file, 'f4').reshape({min(fitting)}, -1).T, or say --bin-columns if they don't"
+        )
 
 
 def _likely(values: list[np.ndarray], possible: list[int]) -> list[int]:

@@ -7,18 +7,22 @@ from collections.abc import Sequence
 
 from dpcli.errors import DataError
 
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937, "km": 1e3}  # meters
+UNITS = {  # meters
+    **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3},
+    **{"ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937},
+}
 _SPELLED = {
     **{word: "m" for word in ("m", "meter", "meters", "metre", "metres")},
     **{word: "mm" for word in ("mm", "millimeter", "millimeters", "millimetre", "millimetres")},
     **{word: "cm" for word in ("cm", "centimeter", "centimeters", "centimetre", "centimetres")},
     **{word: "ft" for word in ("ft", "foot", "feet")},
     **{word: "in" for word in ("inch", "inches")},
-    "km": "km",
+    **{word: "um" for word in ("um", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres")},
+    **{"km": "km", "dm": "dm"},
 }
 _ABOUT_POINTS = frozenset(
     "point points pt pos position coord coords coordinate coordinates cartesian cart field fields loc location data p"
-    " xyz local world global axis vertex".split()
+    " xyz local world global axis vertex koord koordinate koordinaten coordonnée coordonnées".split()
 )
 _ABOUT_COLORS = frozenset(
     "diffuse color colour colors colours col vertex rgb scalar field channel point points".split()
@@ -26,6 +30,7 @@ _ABOUT_COLORS = frozenset(
 _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height", "altitude", "z"))
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")
+_WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
 _FRAME = re.compile(
     r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq|#|№)?[.]?",
     re.IGNORECASE,
@@ -37,8 +42,11 @@ def words_of(name: str) -> list[str]:
 
     >>> words_of("posX [mm]"), words_of("Points:0"), words_of("//X"), words_of("detected_object.y_m")
     (['pos', 'x', 'mm'], ['points', '0'], ['x'], ['detected', 'object', 'y', 'm'])
+    >>> words_of("x [µm]"), words_of("Höhe")  # a letter beyond ASCII ends no word: "m" alone would be meters
+    (['x', 'um'], ['höhe'])
     """
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+    plain = re.sub("[\u00b5\u03bc]", "u", name)  # two letters look like a micro sign
+    return [word.lower() for word in _WORD.findall(plain)]
 
 
 def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
@@ -84,6 +92,7 @@ def _axis(name: str) -> tuple[int, int, str] | None:
     words = words_of(name)
     unit = unit_of(name)
     rest = words[:-1] if unit else words
+    rest = rest[:-1] if unit and rest[-1:] == ["in"] else rest  # "x in mm"
     first_return = rest[-1:] == ["1"]  # as lidars call it that report two
     rest = rest[:-1] if first_return else rest
     letters = [word for word in rest if word in ("x", "y", "z")]

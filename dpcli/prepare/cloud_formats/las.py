@@ -27,6 +27,7 @@ _MODEL_KEY, _UNIT_KEY, _HEIGHT_UNIT_KEY = 1024, 3076, 4099  # of GeoTIFF: kind o
 _GEOGRAPHIC = 2  # the model of longitudes and latitudes
 _SIZES = struct.Struct("<HII")  # at byte 94: of the header, where the points begin, how many records lie between
 _RECORD, _LATE_RECORD = 54, 60  # bytes at least of a record before the points, and of one behind them
+_FINEST, _COARSEST = 1e-15, 1e15  # of a number of the file, in units of length
 _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
 
@@ -46,6 +47,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
         raise DataError(f"{path}: not a readable {kind} file, perhaps truncated ({error})") from None
     if len(las.points) != las.header.point_count:
         raise DataError(f"{path}: truncated: its header says {las.header.point_count} points, found {len(las.points)}")
+    _check_scales(path, las.header.scales)
     names = list(las.point_format.dimension_names)
     color = np.stack([np.asarray(las[name]) for name in _COLORS], axis=1) if set(_COLORS) <= set(names) else None
     if color is not None and not color.any():
@@ -62,6 +64,13 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
         cloud.keep(~withheld)
         cloud.dropped[WITHHELD] = int(withheld.sum())
     return cloud
+
+
+def _check_scales(path: Path, scales: np.ndarray) -> None:
+    """Raises DataError for a scale that no coordinate has: 0 puts all points into one plane, without a word."""
+    for axis, scale in zip("xyz", scales):
+        if not _FINEST < abs(scale) < _COARSEST:
+            raise DataError(f"{path}: damaged: its header scales {axis} by {scale:g}; expected such as 0.001")
 
 
 def _load_laspy() -> ModuleType:

@@ -36,7 +36,7 @@ class ParquetTable:
             raise
         except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
             raise DataError(
-                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({error})"
+                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({' '.join(str(error).split())})"
             ) from None
         self.names = tuple(self._table.column_names)
 
@@ -44,18 +44,43 @@ class ParquetTable:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
         found = []
         for place in places:
-            values = self._table.column(place).to_numpy()
-            if values.dtype.kind == "M":
-                values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
+            column = self._table.column(place)
             try:
-                found.append(values.astype(np.float64))
+                if _parts_of_second(column.type):
+                    raise ValueError("times are no numbers")
+                found.append(column.to_numpy().astype(np.float64))
             except (TypeError, ValueError):
                 raise DataError(f"{self.path}: column {self.names[place]!r} holds no numbers") from None
         return np.stack(found, axis=1) if found else np.zeros((self._table.num_rows, 0))
 
     def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as text."""
-        return [str(value) for value in self._table.column(place).to_pylist()]
+        """Returns the cells of a column as text, "" of an empty one."""
+        return [
+            "" if value is None or value != value else str(value) for value in self._table.column(place).to_pylist()
+        ]
+
+    def moments(self, place: int) -> np.ndarray | None:
+        """Returns the seconds f64 (N) since the first of a column of times or durations, NaN where it is empty; None of other
+        types.
+        """
+        column = self._table.column(place)
+        parts = _parts_of_second(column.type)
+        if not parts:
+            return None
+        kind = "int32" if column.type.bit_width == 32 else "int64"
+        whole = column.cast(kind)
+        first = next((value for value in whole.to_pylist() if value is not None), 0)
+        counted = (whole.fill_null(first).to_numpy() - first) / parts
+        return np.where(column.is_valid().to_numpy(), counted, np.nan)
+
+
+def _parts_of_second(kind: Any) -> int:
+    """Returns how many units of a type of times or durations make a second; 0 of types that hold none."""
+    import pyarrow.types as types
+
+    if not (types.is_timestamp(kind) or types.is_time(kind) or types.is_duration(kind)):
+        return 0
+    return {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
 
 
 def _read_feather(path: Path) -> Any:

@@ -50,6 +50,11 @@ def _scans(path: Path, lines: list[str]) -> Iterator[np.ndarray]:
         if values is None or width not in (4, 7):
             raise DataError(f"{path}: a row of a scan is no x y z intensity [red green blue]; damaged, export it again")
         matrix = np.array(header[6:])
+        if not np.allclose(matrix[:, 3], (0, 0, 0, 1)):
+            raise DataError(
+                f"{path}: the matrix in rows {start + 7} to {start + 10} doesn't end with 0 0 0 1 in its last column, as PTX"
+                " has it, whose last row is the scanner's place; export it again, or transpose it"
+            )
         met = (values[:, :3] != 0).any(1)
         values[:, :3] = np.where(met[:, None], values[:, :3] @ matrix[:3, :3] + matrix[3, :3], np.nan)
         yield values

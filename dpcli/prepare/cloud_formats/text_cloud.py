@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +20,12 @@ from dpcli.prepare.cloud_formats.cloud import (
     without,
 )
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
+from dpcli.prepare.cloud_formats.text_numbers import COMMENTS, TextTable, read_text_table
 
+_MARK = re.compile(
+    r"\b(frame|scan|sweep|step|cloud|time|time_?stamp|t)\b[\s_.:=#]*(id|no|number|index)?[\s:=#]*\d", re.IGNORECASE
+)
+BLOCKS = "texts whose rows stand in blocks between empty lines, each read as one cloud"
 _TELLING = 10  # rows that tell what columns without names hold
 _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
     (".pts", 4): "x y z intensity",
@@ -41,7 +46,9 @@ def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
         names = _IMPLIED.get((path.suffix.lower(), table.width), "")
         table = replace(table, names=tuple(names.split()))
     refuse_frames(table)
-    return cloud_of_table(table, keep)
+    _refuse_marked_frames(table)
+    cloud = cloud_of_table(table, keep)
+    return replace(cloud, dropped={BLOCKS: 1}) if "\n\n\n" in table.body.rstrip() else cloud
 
 
 def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
@@ -88,6 +95,19 @@ def _first_axis(table: TextTable, values: np.ndarray) -> int:
         f"{table.path}: its first {f'{whole} columns hold' if whole > 1 else 'column holds'} whole numbers, the three behind"
         " fractions; which are x, y and z? Write a line of names above, such as: row column x y z intensity"
     )
+
+
+def _refuse_marked_frames(table: TextTable) -> None:
+    """Raises DataError where comments between the rows number frames, which one cloud would mix up."""
+    if not any(sign in table.body for sign in COMMENTS):
+        return
+    rows = table.body.rstrip().split("\n")
+    marks = [row.strip() for row in rows[:-1] if row.lstrip().startswith(COMMENTS) and _MARK.search(row)]
+    if marks:
+        raise DataError(
+            f"{table.path}: comments such as {marks[0]!r:.60} divide its rows into frames; save each as its own file, or"
+            " write the number into a column called frame"
+        )
 
 
 def refuse_frames(table: TextTable) -> None:

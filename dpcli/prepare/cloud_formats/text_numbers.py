@@ -25,7 +25,7 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_COMMENT = ("#", "//", "%")
+COMMENTS = ("#", "//", "%")
 _SHEET_ERRORS = ("#n/a", "#na", "#value!", "#div/0!", "#num!", "#ref!", "#null!", "#name?")  # of spreadsheets
 _MISSING = frozenset(
     ("", "nan", "-nan", "+nan", "na", "n/a", "null", "none", "nil", "-", "nan(ind)", "-nan(ind)", *_SHEET_ERRORS)
@@ -33,7 +33,11 @@ _MISSING = frozenset(
 _NOT_A_NUMBER = re.compile(r"[-+]?1[.,]#(qnan|snan|ind|inf)\w*", re.IGNORECASE)  # as Windows writes it
 _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
+_FRACTION = re.compile(r"[-+]?\d+\.\d+")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
+_SPACED_COMMAS = re.compile(r"[-+]?\d+,\d+(, +[-+]?\d+,\d+)+")
+_POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+")
+_BELOW_THOUSAND = re.compile(r"[-+]?[1-9]\d{0,2}")  # which groups of thousands leave as they are
 _EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
 _HEAD = 200  # lines among which the header is looked for
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
@@ -89,7 +93,8 @@ class TextTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError that names the line."""
-        doubtful = self.delimiter != "," and _may_be_thousands(self.body)
+        signs = {",": "", ";": ",.", "\t": ",."}.get(self.delimiter or "", ",")  # that may divide thousands
+        doubtful = bool(signs) and _may_be_thousands(self.body, signs)
         sure = self.width and not doubtful
         plain = parse_plain(self.body, self.width, self.delimiter, self.limit) if sure else None
         if plain is not None:
@@ -100,6 +105,10 @@ class TextTable:
     def words(self, place: int) -> list[str]:
         """Returns the cells of a column as they are written."""
         return [self._row(line, number)[place] for number, line in self.numbered]
+
+    def moments(self, place: int) -> np.ndarray | None:
+        """Returns None: a column of a text has no type that says it holds times."""
+        return None
 
     def _read_fast(self, places: list[int]) -> np.ndarray | None:
         """Returns what NumPy reads where some columns hold words; None where the text is none that it reads right."""
@@ -149,36 +158,58 @@ class TextTable:
         """Returns the decimal sign of the cells. Raises DataError where points and commas contradict one another."""
         commas = [row[place] for row in rows for place in places if "," in row[place]]
         if not commas:
-            return "."
+            return self._decimal_of_points(rows, places)
         both = [cell for cell in commas if "." in cell]
         signs = {max(".,", key=cell.rfind) for cell in both}
         if not both:
             others = [row[place] for row in rows for place in places if "," not in row[place]]
             points = any("." in cell for cell in others)
             grouped = all(_THOUSANDS.fullmatch(cell) for cell in commas)
-            whole = [cell for cell in others if re.fullmatch(r"[-+]?[1-9]\d{0,2}", cell)]  # as groups leave below 1,000
+            whole = [cell for cell in others if _BELOW_THOUSAND.fullmatch(cell)]
             if grouped and whole and not points and self.delimiter != ",":
                 raise DataError(
                     f"{self.path}: {commas[0]} beside {whole[0]} may be {commas[0].replace(',', '')} or"
                     f" {commas[0].replace(',', '.')}; expected numbers without groups of thousands"
                 )
-            signs = {"."} if grouped and (points or whole) else {","} if not points else set()
+            english = self.delimiter == "," and any(_FRACTION.fullmatch(cell) for row in rows for cell in row)
+            signs = {"."} if grouped and (points or whole or english) else {","} if not points else set()
         if len(signs) != 1:
             raise DataError(f"{self.path}: numbers such as {commas[0]} beside others with a point; expected one style")
         return signs.pop()
 
+    def _decimal_of_points(self, rows: list[list[str]], places: list[int]) -> str:
+        """Returns the decimal sign of cells without commas. Raises DataError where a column of points in groups of three digits
+        holds whole numbers, too, as where they divide thousands.
+        """
+        for place in places:
+            column = [row[place] for row in rows]
+            pointed = [cell for cell in column if "." in cell]
+            if any(cell.count(".") > 1 for cell in pointed):
+                return ","
+            whole = [cell for cell in column if _BELOW_THOUSAND.fullmatch(cell)]
+            if self.delimiter in (";", "\t") and pointed and whole and all(map(_POINTED.fullmatch, pointed)):
+                raise DataError(
+                    f"{self.path}: {pointed[0]} beside {whole[0]} may be {pointed[0].replace('.', '')} or {pointed[0]};"
+                    " expected numbers without groups of thousands"
+                )
+        return "."
 
-def _may_be_thousands(body: str) -> bool:
-    """Returns whether every comma of a text may divide thousands, such as 1,500: no other number tells decimal commas."""
-    if "," not in body or "." in body:
+
+def _may_be_thousands(body: str, signs: str) -> bool:
+    """Returns whether all of a text's commas, or all its points, may divide thousands, such as 1,500: no other number tells
+    decimals. signs: which of the two may.
+    """
+    found = [sign for sign in ",." if sign in body]
+    if len(found) != 1 or found[0] not in signs:
         return False
-    return re.search(r",(?!\d{3}(?![\d,]))|(?<!\d)0,|\d{4},|(?<!\d),", body) is None
+    sign = f"[{found[0]}]"
+    return re.search(rf"{sign}(?!\d{{3}}(?!\d))|(?<!\d)0{sign}|\d{{4}}{sign}|(?<!\d){sign}", body) is None
 
 
 def _is_comment(line: str) -> bool:
     """Returns whether a line says something about the rows; one that begins with a spreadsheet's error is a row."""
     start = line.lstrip()
-    return start.startswith(_COMMENT) and not start.lower().startswith(_SHEET_ERRORS)
+    return start.startswith(COMMENTS) and not start.lower().startswith(_SHEET_ERRORS)
 
 
 def _trimmed(cells: list[str], width: int = 0) -> list[str]:
@@ -211,7 +242,7 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
 
     may_be_empty: names without rows are a table, too, such as of a moment in which a radar saw nothing.
     """
-    text = decode_text(path)
+    text = decode_text(path).replace("\u2212", "-")  # the minus of typographers, as some languages' numbers have it
     head = list(enumerate(text.split("\n", _HEAD)[:_HEAD], 1))
     head = [(k, line.strip(_EDGES)) for k, line in head if line.strip()]
     if not head:
@@ -231,7 +262,7 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
     if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
         table = _without_count(table, *rows)
         rows = rows[1:] or rows
-    table = replace(table, delimiter=delimiter or _delimiter(rows[0][1]))
+    table = _with_row_names(replace(table, delimiter=delimiter or _delimiter(rows[0][1])), rows)
     return table if names else _checked_unnamed(_with_counted_header(table))
 
 
@@ -248,6 +279,14 @@ def _with_units(table: TextTable) -> TextTable:
     names = tuple(f"{name} [{unit}]" if place in axes[0] else name for place, name in enumerate(table.names))
     number = table.first_line + row[0].count("\n")
     return replace(table, names=names, body=table.body[row.end() :], first_line=number)
+
+
+def _with_row_names(table: TextTable, rows: list[tuple[int, str]]) -> TextTable:
+    """Returns the table, its first column taken for the names of rows where the header has none for it, as R writes it."""
+    unnamed = [cells[0] for _, row in rows if len(cells := _trimmed(table.cells(row))) == len(table.names) + 1]
+    if not table.names or len(unnamed) != len(rows) or unnamed != ["1", "2"][: len(rows)]:
+        return table
+    return replace(table, names=("", *table.names))
 
 
 def _with_counted_header(table: TextTable) -> TextTable:
@@ -269,7 +308,7 @@ def decode_text(path: Path) -> str:
     """Returns the text of a file in UTF-8, or in UTF-16 or 32 by its mark or its zeros; else byte by byte (Latin-1)."""
     data = path.read_bytes()
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
-    if not encoding and b"\0" in data[:200]:
+    if not encoding and b"\0" in data[:200].rstrip(b"\0"):  # zeros at the end are what a crash leaves
         zeros = [data[:200][k::2].count(0) for k in (0, 1)]
         if min(zeros) > 5 or max(zeros) < len(data[:200]) // 4:
             raise DataError(f"{path}: not text; expected numbers in columns")
@@ -288,7 +327,7 @@ def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None)
         names = _names(line, delimiter)
         if names and named_axes(path, names) is not None:
             return number + 1, names
-    number, line = next((one for one in head if not one[1].startswith(_COMMENT)), head[0])
+    number, line = next((one for one in head if not one[1].startswith(COMMENTS)), head[0])
     if not all(
         re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
     ):
@@ -341,7 +380,8 @@ def _checked_unnamed(table: TextTable) -> TextTable:
     if table.delimiter == "," and not any('"' in line for _, line in rows):
         cells = [cell for _, line in rows for cell in table.cells(line)]
         whole = all(re.fullmatch(r"[-+]?\d+|", cell) for cell in cells)
-        if whole and any(re.fullmatch(r"-0|0\d+", cell) for cell in cells):
+        spaced = all(_SPACED_COMMAS.fullmatch(line) for _, line in rows)
+        if whole and (spaced or any(re.fullmatch(r"-0|0\d+", cell) for cell in cells)):
             raise DataError(
                 f"{table.path}:{rows[0][0]}: decimal commas between commas can't be told apart; save it with"
                 " decimal points, or with semicolons between the columns"

@@ -14,6 +14,7 @@ from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.regular_files import stand_in
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".ply": read_ply,
@@ -46,6 +47,13 @@ def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] =
     """
     if path.stat().st_size == 0:
         raise DataError(f"{path}: the file is empty")
+    try:
+        return _read(path, bin_columns, keep)
+    except DataError as error:
+        raise (stand_in(path) or error) from None
+
+
+def _read(path: Path, bin_columns: int | None, keep: Sequence[str]) -> Cloud:
     if path.suffix.lower() != ".bin":
         return _READERS[path.suffix.lower()](path, keep)
     if keep:

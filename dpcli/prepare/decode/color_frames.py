@@ -18,11 +18,36 @@ from dpcli.runtime.clips.animations import animation_frames, animation_times, is
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.name_numbers import in_order
+from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
-_CAMERAS = ("cameras.json", "cameras.txt", "cameras.bin", "poses_bounds.npy", "sparse")  # of others
+_CAMERAS = (  # of others, in the folder of the images or in the one above
+    *(
+        "cameras.json",
+        "cameras.txt",
+        "cameras.bin",
+        "poses_bounds.npy",
+        "sparse",
+        "cameras",
+        "camera",
+        "poses",
+        "poses.txt",
+    ),
+    *("transforms.json", "transforms_train.json"),
+)
+PICTURE_FOLDERS = {
+    "ref",
+    "rgba",
+    "rgb",
+    "images",
+    "image",
+    "img",
+    "imgs",
+    "frames",
+    "color",
+}  # names that say nothing else
 _ORIENTATION = 0x0112  # of EXIF
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
@@ -132,13 +157,11 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
         paths = [path for path in paths if path.name in chosen.names]
     elif not paths:
         refuse_clips(folder, _ALL, 'dpc prepare video "$clip" -o "$clip.h5"')
-        inside = sorted(p.name for p in folder.iterdir() if p.is_dir())[:3]
-        hint = f"; it has folders ({', '.join(inside)}): name one of them" if inside else ""
-        raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
+        raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){_held_instead(folder)}")
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
         log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
-    if not quiet and (cameras := [name for name in _CAMERAS if (folder / name).exists()]):
+    if not quiet and (cameras := _cameras_beside(folder)):
         log.warn(
             f"{folder}: {first_names(cameras)}: not read; the camera of a clip is taken to stand still, and where it moves the "
             "object seems to. Cameras are read from transforms.json, with a time for each frame"
@@ -153,6 +176,29 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     if any(a >= b for a, b in zip(numbers, numbers[1:])):
         numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3
     return Frames(folder, tuple(p.name for p in paths), tuple(numbers), tuple(paths))
+
+
+def _held_instead(folder: Path) -> str:
+    """Returns what a folder without frames holds, for its error: folders, or files of another kind; "" for neither."""
+    inside = sorted(path.name for path in folder.iterdir() if path.is_dir())[:3]
+    if inside:
+        return f"; it has folders ({', '.join(inside)}): name one of them"
+    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    if not files:
+        return ""
+    if not files[0].suffix and is_image_file(files[0]):
+        return f"; {files[0].name} is an image without the suffix of one: give each its own"
+    return f"; {files[0].name}: {no_video(files[0])}"
+
+
+def _cameras_beside(folder: Path) -> list[str]:
+    """Returns the names of cameras that other programs left in a folder, or in the one above where its name says only that it
+    holds pictures.
+    """
+    places = [folder, folder.resolve().parent] if folder.resolve().name.lower() in PICTURE_FOLDERS else [folder]
+    beside = [name for name in _CAMERAS if any((place / name).exists() for place in places)]
+    exported = sorted(folder.glob("*.xmp"))[:1]  # of RealityCapture, one for each image
+    return [*beside, *(path.name for path in exported if b"xcr:" in path.read_bytes())]
 
 
 def read_rgba(path: Path) -> np.ndarray:

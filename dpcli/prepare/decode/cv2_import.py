@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from dpcli.runtime.clips.video_frames import VIDEO_FORMATS
+from dpcli.runtime.clips.container_ends import VIDEO_FORMATS
 
 
 def load_cv2():  # -> module

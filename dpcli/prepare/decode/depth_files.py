@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy, require_room
+from dpcli.npy_files import map_npy, read_arrays
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.deep_video import deep_frames
-from dpcli.prepare.decode.exr import read_exr
-from dpcli.prepare.decode.png import check_picture, decode_gray_png
-from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
+from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
+from dpcli.regular_files import stand_in
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
-from dpcli.runtime.clips.video_frames import missing_frames
+
+if TYPE_CHECKING:
+    from dpcli.prepare.decode.video_streams import VideoStream
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
@@ -34,6 +36,15 @@ _GRAY_NOISE, _COLORED_SHARE = (
 )  # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
+_SIZES = (  # (height, width) of depth cameras
+    *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
+    *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
+)
+_LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
+WHITE_AT_ZERO = (
+    "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
+)
+_PHOTOMETRIC = 262  # the tag of TIFF that says so
 LEFT_OUT = "frames without bytes, which the recording program left out"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
@@ -106,6 +117,9 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
 
     Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
     """
+    from dpcli.prepare.decode.deep_video import deep_frames  # for videos alone: folders of images start without it
+    from dpcli.prepare.decode.video_streams import depth_stream
+
     capture = _opened(path)
     try:
         tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
@@ -142,6 +156,8 @@ def _declared_frames(capture) -> int:
 
 def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
     """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
+    from dpcli.runtime.clips.video_frames import missing_frames
+
     seen = count * stride  # but for the last few
     missing = missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
     return missing or max(promised_frames(path) - max(declared, seen), 0)
@@ -206,12 +222,16 @@ def _colored(frame: np.ndarray) -> bool:
 def read_image(path: Path) -> np.ndarray:
     """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
     if path.suffix.lower() == ".exr":
+        from dpcli.prepare.decode.exr import read_exr
+
         return read_exr(path)
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:
         return image
     check_picture(data, path)
+    if (image := _portable_map(data, path)) is not None:
+        return image
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages:
@@ -222,14 +242,66 @@ def read_image(path: Path) -> np.ndarray:
         )
     image = pages[0]
     if image.ndim == 3:
-        if image.shape[2] != 3 or (image != image[..., :1]).any():
+        opaque = image.shape[2] == 4 and image.dtype.kind == "u" and (image[..., 3] == np.iinfo(image.dtype).max).all()
+        if image.shape[2] != 3 + opaque or (image[..., :3] != image[..., :1]).any():
             raise DataError(f"{path}: a color image of shape {image.shape}; expected one gray channel of depth")
         image = image[..., 0]
+    if image.dtype == np.uint8 and has_white_at_zero(data):
+        return 255 - image  # which OpenCV turned round, of 8 bits alone
     return image
+
+
+def has_white_at_zero(data: bytes) -> bool:
+    """Returns whether the bytes are those of a TIFF that says its 0 is white; what that means for depth, nobody says."""
+    if not data.startswith((b"II", b"MM")):
+        return False
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
+    except (OSError, ValueError, SyntaxError, TypeError):  # a kind of TIFF that Pillow doesn't know
+        return False
+
+
+def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
+    """Returns the gray levels of a PGM in text as they are written, u8 or u16 (H,W): OpenCV spreads those below 256 over all
+    bytes. None of other files, unless they are what OpenCV changes unasked: PFM with a scale, PNG of fewer than 8 bits.
+
+    Raises DataError of these two, and of texts that end early.
+    """
+    if data.startswith((b"Pf", b"PF")):
+        words = data[:200].split(None, 4)[:4]
+        if len(words) == 4 and words[3].lstrip(b"+-").rstrip(b"0").rstrip(b".") not in (b"1", b""):
+            raise DataError(
+                f"{path}: its header gives the scale {words[3].decode('latin-1')}, by which some readers divide and others"
+                " don't; save it with the scale 1 or -1"
+            )
+    elif (header := read_header(data)) and header.bits < 8 and header.color == 0:
+        raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
+    if not data.startswith(b"P2"):
+        return None
+    try:
+        width, height, most, *levels = map(int, re.sub(rb"#[^\r\n]*", b"", data[2:]).split())
+    except ValueError:
+        raise DataError(f"{path}: not a readable PGM; expected whole numbers") from None
+    if len(levels) != width * height or not 0 < most < 65536 or max(levels, default=0) > most:
+        raise DataError(
+            f"{path}: {len(levels)} levels of {width}x{height} pixels, up to {max(levels, default=0)} of {most}: truncated or"
+            " damaged"
+        )
+    return np.array(levels, np.uint8 if most < 256 else np.uint16).reshape(height, width)
 
 
 def read_frame(path: Path) -> np.ndarray:
     """Reads one frame (H,W) of a folder: an image, or an array in ``.npy`` or ``.npz``."""
+    try:
+        return _frame(path)
+    except DataError as error:
+        raise (stand_in(path) or error) from None
+
+
+def _frame(path: Path) -> np.ndarray:
     if path.suffix.lower() not in ARRAY_SUFFIXES:
         return read_image(path)
     array = read_array(path)
@@ -309,21 +381,26 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
         raise DataError(
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
         )
+    _require_frames_first(path, array.shape)
     if array.shape[1:] in ((3, 3), (3, 4), (4, 4)) and _are_matrices(array):
         raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
     return np.ascontiguousarray(array[::stride])
 
 
+def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
+    """Raises DataError of a shape whose last axis seems to count frames: its first two are a camera's, or the last is tiny."""
+    *first, last = shape
+    usual = tuple(first) in _SIZES and (first[1], last) not in _SIZES and (last, first[1]) not in _SIZES
+    if usual or (min(first) >= _LEAST and min(first) >= _TALL * last):
+        raise DataError(
+            f"{path}: array of shape {shape}; expected (frames, height, width): if its last axis counts the frames, save"
+            " numpy.moveaxis(array, -1, 0)"
+        )
+
+
 def _archived(path: Path) -> np.ndarray:
     """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
-            arrays = {key: array for key in archive.files if isinstance(array := archive[key], np.ndarray)}
-    except DataError:
-        raise
-    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
-        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    arrays = read_arrays(path)
     called = [key for key in arrays if says_depth(key)]
     shaped = [key for key, array in arrays.items() if array.ndim in (2, 3) and array.dtype.kind in "uif"]
     chosen = next((choice[0] for choice in (called, shaped) if len(choice) == 1), None)
@@ -351,18 +428,28 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         if series is None:
             raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
         times = series.times()
-        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride])
-    elif suffix in ARRAY_SUFFIXES:
-        video = DepthVideo(read_array(path, stride))
-    elif suffix in VIDEO_SUFFIXES:
-        frames, time, missing = read_timed_video(path, stride)
-        if not frames:
-            raise DataError(f"{path}: an empty video: no frame can be decoded")
-        left = empty_frames(path, 0)
-        notes = {LEFT_OUT: left} if left else {}
-        video = DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)
+        first = series.paths[0]
+        white = first.suffix.lower() in (".tif", ".tiff") and has_white_at_zero(first.read_bytes())
+        notes = {WHITE_AT_ZERO: 1} if white else {}
+        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], notes=notes)
+    elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
+        try:
+            video = _read_file(path, stride)
+        except DataError as error:
+            raise (stand_in(path) or error) from None
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy, .npz or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:
         raise DataError(f"{path}: an empty video: shape {video.frames.shape}")
     return video
+
+
+def _read_file(path: Path, stride: int) -> DepthVideo:
+    """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
+    if path.suffix.lower() in ARRAY_SUFFIXES:
+        return DepthVideo(read_array(path, stride))
+    frames, time, missing = read_timed_video(path, stride)
+    if not frames:
+        raise DataError(f"{path}: an empty video: no frame can be decoded")
+    left = empty_frames(path, 0)
+    return DepthVideo(np.stack(frames), time, missing, ends_early(path), {LEFT_OUT: left} if left else {})

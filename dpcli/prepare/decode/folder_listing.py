@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.prepare.series import is_hidden
 from dpcli.regular_files import why_unreadable
 
 
@@ -15,6 +16,24 @@ def leads_out(path: Path, root: Path) -> str:
     target = os.path.realpath(path)
     inside = os.path.realpath(root)
     return "" if target == inside or target.startswith(inside.rstrip(os.sep) + os.sep) else target
+
+
+def walk_folders(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yields what `os.walk` does: of all folders below ``root`` that aren't hidden, those that links name too, but for links
+    to a folder above. Whoever takes a name from the list of folders keeps it from being entered.
+    """
+    for folder, below, names in os.walk(root, followlinks=True):
+        below[:] = [name for name in below if not is_hidden(name) and not _leads_above(os.path.join(folder, name))]
+        yield folder, below, names
+
+
+def _leads_above(path: str) -> bool:
+    """Returns whether a folder is a link to one that holds it, on the way by which it was reached or in truth."""
+    if not os.path.islink(path):
+        return False
+    target = os.path.realpath(path)
+    above = [os.path.realpath(one) for one in Path(os.path.abspath(path)).parents]
+    return any(one == target or one.startswith(target.rstrip(os.sep) + os.sep) for one in above)
 
 
 def folder_files(folder: Path, root: Path, suffix: str) -> Iterator[tuple[str, Path]]:
@@ -51,20 +70,21 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
             if entry.is_file(follow_symlinks=False):  # nearly all; the listing knows it, nothing else is asked
                 continue
             path = Path(entry.path)
-            if not _is_folder(entry):
+            if not is_folder(entry):
                 found += [(path, reason)] if (reason := why_unreadable(path)) else []
                 continue
-            if entry.is_symlink() and os.path.realpath(folder).startswith(os.path.realpath(path)):
+            if above := _leads_above(entry.path):
                 found.append((path, "a link to a folder above it"))
             elif path.suffix.lower() in suffixes and not any(path == one or path in one.parents for one in taken):
                 found.append((path, "a folder, though named like a file of data"))
-            if not entry.is_symlink():
+            if not above:
                 waiting.append(path)
     return sorted((path, reason) for path, reason in found if path not in taken)
 
 
-def _is_folder(entry: os.DirEntry[str]) -> bool:
+def is_folder(entry: os.DirEntry[str]) -> bool:
+    """Returns whether an entry is a folder, or a link to one; a link in a circle is none."""
     try:
         return entry.is_dir()
-    except OSError:  # a link in a circle
+    except OSError:
         return False

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import require_room
+from dpcli.npy_files import read_member, require_room
 from dpcli.prepare.decode.safe_pickle import load_arrays
 
 
@@ -33,7 +33,7 @@ def read_frames(path: Path, key: str) -> list[np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             info = archive.getinfo(f"{key}.npy")
             require_room(path, info.file_size)
-            array = _read_array(io.BytesIO(archive.read(info)))
+            array = _read_array(path, archive.read(info))
     except pickle.UnpicklingError as error:
         raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None
     except DataError:
@@ -43,14 +43,14 @@ def read_frames(path: Path, key: str) -> list[np.ndarray]:
     return [_frame(path, key, t, frame) for t, frame in enumerate(_as_frames(path, key, array))]
 
 
-def _read_array(stream: io.BytesIO) -> np.ndarray:
+def _read_array(path: Path, data: bytes) -> np.ndarray:
+    stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = header(stream)
     if dtype.hasobject:
         return load_arrays(stream)
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
+    return read_member(path, data)
 
 
 def _as_frames(path: Path, key: str, array: object) -> list:

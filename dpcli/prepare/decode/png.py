@@ -16,7 +16,6 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import is_plausible, require_plausible
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = b"\0\0\0\0IEND\xaeB`\x82"
@@ -71,6 +70,8 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
     Returns None for all else (another kind of file, a damaged one, no kornia-rs): OpenCV decodes that, or the caller
     says what is wrong with it.
     """
+    from dpcli.runtime.clips.images import is_plausible
+
     header = read_header(data)
     if header is None or not data.endswith(_END) or header.color != 0 or header.bits not in _decoders():
         return None
@@ -119,6 +120,8 @@ def check_picture(data: bytes, where: str | Path) -> None:
 
     OpenCV gets nothing else: it takes as much memory as a header or a damaged chunk claims.
     """
+    from dpcli.runtime.clips.images import require_plausible
+
     if not data.startswith(_SIGNATURE):
         _check_size(data, where)
         return
@@ -141,6 +144,8 @@ def check_picture(data: bytes, where: str | Path) -> None:
 def _check_size(data: bytes, where: str | Path) -> None:
     """Raises DataError for a picture of another kind whose size isn't plausible; of kinds that Pillow doesn't know it passes."""
     from PIL import Image
+
+    from dpcli.runtime.clips.images import require_plausible
 
     try:
         with Image.open(io.BytesIO(data)) as image:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import require_room
+from dpcli.npy_files import read_member, require_room
 
 _CODE = re.compile(
     r"[biufcSUO]\d{0,9}"
@@ -197,14 +197,14 @@ def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: boo
         data = archive.read(info)
         stream = io.BytesIO(data)
         if not pickled:
-            return np.lib.format.read_array(stream, allow_pickle=False)
+            return read_member(path, data)
         version = np.lib.format.read_magic(stream)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = header(stream)
         if dtype.hasobject and shape != ():
             raise DataError(f"{path}: {key} is an object array of shape {shape}; expected shape ()")
         if not dtype.hasobject:
-            return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+            return read_member(path, data)
         return load_arrays(stream).item()
     except pickle.UnpicklingError as error:
         raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None

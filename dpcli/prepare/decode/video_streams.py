@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
-from dpcli.runtime.clips.video_frames import VIDEO_FORMATS
+from dpcli.runtime.clips.container_ends import VIDEO_FORMATS
 
 _STREAM = re.compile(r"\s*Stream #0:\d+.*?: (Video|Audio|Subtitle|Data|Attachment): (.*)")
 _TITLE = re.compile(r"\s+(?:title|handler_name)\s*: (.*)")

@@ -1,4 +1,4 @@
-"""This folder holds animated meshes: glTF, skinning, and virtual cameras that film them.
+"""This folder holds animated meshes: glTF, skinning, and virtual cameras that film them; and the reader of still meshes.
 
-Still meshes of rooms and robots live in `prepare/articulated`.
+Rooms and robots of still meshes live in `prepare/articulated`.
 """

@@ -53,7 +53,8 @@ class AnimatedMesh:
     bone_pose: f64 (T,B,4,4) bone to world. bone_parent: i64 (B), -1 for roots; parents may come after children.
     emission_uv: f32 (V,2) where the emission's textures are looked up, None: at uv. one_sided: bool (F) triangles that
     are not seen from behind, None: all are seen from both sides. faceted: bool (F) triangles that are lit by the plane they
-    lie in, not by the normals of their corners, None: none.
+    lie in, not by the normals of their corners, None: none. turned: bool (T,F) which triangles are mirrored in a frame, so that
+    their front is where they run clockwise, None: none.
     """
 
     name: str
@@ -73,6 +74,7 @@ class AnimatedMesh:
     emission_uv: np.ndarray | None = None
     one_sided: np.ndarray | None = None
     faceted: np.ndarray | None = None
+    turned: np.ndarray | None = None
 
     @property
     def num_frames(self) -> int:
@@ -102,7 +104,7 @@ class AnimatedMesh:
         """Returns frames start to stop - 1 alone; small enough to send to another process."""
         cut = slice(start, stop)
         kept = {key: getattr(self, key)[cut] for key in ("time", "positions", "normals", "bone_pose")}
-        return replace(self, **kept)
+        return replace(self, **kept, turned=None if self.turned is None else self.turned[cut])
 
     def moved(self, rotation: np.ndarray, shift: np.ndarray, scale: float) -> AnimatedMesh:
         """Applies x -> scale R x + shift; shift (3), or (T,3): one per frame."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
-from dpcli.prepare.meshes.gltf import Gltf, read_gltf
+from dpcli.prepare.meshes.gltf import Gltf, read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
 from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
@@ -21,23 +19,12 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import file_digest
 
 
-@contextmanager
-def _well_formed(path: Path) -> Iterator[None]:
-    """Turns what a damaged file makes of our assumptions (a text for a number, a missing key) into a DataError."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
-        raise DataError(
-            f"{path}: not built as glTF 2.0 asks ({type(error).__name__}: {error}); export it again"
-        ) from error
-
-
 def list_clips(path: Path) -> list[tuple[str, float | None]]:
     """Returns (name, seconds) of every clip of a file; None, with a warning, for one that is broken or moves nothing.
 
     Raises DataError when the file is broken, or has no clip.
     """
-    with _well_formed(path):
+    with well_formed(path):
         file = read_gltf(path)
         choose_clip(file, None)
         return [(name, _seconds(file, index)) for index, name in enumerate(clip_names(file))]
@@ -45,7 +32,7 @@ def list_clips(path: Path) -> list[tuple[str, float | None]]:
 
 def _seconds(file: Gltf, index: int) -> float | None:
     try:
-        with _well_formed(file.path):
+        with well_formed(file.path):
             clip = read_clip(file, index)
     except DataError as error:
         log.warn(str(error))
@@ -75,7 +62,7 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
     """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own
     units.
     """
-    with _well_formed(path):
+    with well_formed(path):
         file = read_gltf(path)
         refuse_required(file)
         name_unread(file)
@@ -87,14 +74,14 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
 
 def load_still(path: Path) -> AnimatedMesh:
     """Reads a .glb or .gltf as it stands, as a mesh of one frame, in the file's own units."""
-    with _well_formed(path):
+    with well_formed(path):
         refuse_required(file := read_gltf(path))
         return bake(file, None, 1)
 
 
 def names_of_clips(path: Path) -> tuple[str, ...]:
     """Returns the names of a file's clips, none for a model that stands still. Raises DataError for a broken file."""
-    with _well_formed(path):
+    with well_formed(path):
         return tuple(clip_names(read_gltf(path)))
 
 
@@ -105,6 +92,6 @@ def animation_clip(path: Path, clip: str | None, frames: int, filming: Filming, 
 
 def animation_config(path: Path, clip: str | None, frames: int, filming: Filming) -> dict[str, Any]:
     """Returns what decides the content, for the file's provenance."""
-    with _well_formed(path):
+    with well_formed(path):
         name = clip_names(file := read_gltf(path))[choose_clip(file, clip)]
     return {"input": path.name, "digest": file_digest(path)[:16], "clip": name, "frames": frames, **filming.config}

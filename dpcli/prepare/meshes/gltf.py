@@ -12,6 +12,8 @@ import binascii
 import io
 import re
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from posixpath import normpath
@@ -40,12 +42,14 @@ class Gltf:
     """Holds a glTF file: its JSON and, read when asked for, its buffers.
 
     `accessor` decodes numbers, `image` gives a texture's encoded bytes; decoded: what accessors (by index) hold that a
-    compressed block gave, (count, components). All errors are DataErrors that name the file.
+    compressed block gave, (count, components). All errors are DataErrors that name the file. root: the folder that the files
+    which it names must lie in, None for any.
     """
 
     path: Path
     tree: dict[str, Any]
     binary: bytes | None = None
+    root: Path | None = None
     decoded: dict[int, np.ndarray] = field(default_factory=dict)
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
@@ -185,8 +189,7 @@ class Gltf:
         return self._buffers[index]
 
     def _resource(self, uri: str) -> bytes:
-        """Returns the bytes of a data: URI or of a file below the folder; anything else is refused, a file may be
-        hostile.
+        """Returns the bytes of a data: URI or of a file below the root; anything else is refused, a file may be hostile.
 
         Names are read as browsers do: \\ is /, white space at the ends and line breaks don't count.
         """
@@ -198,7 +201,7 @@ class Gltf:
             raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it")
         names = [unquote(uri), unquote(re.split("[?#]", uri)[0]), uri]
         try:
-            places = [path_inside(folder, folder, normpath(name.replace("\\", "/"))) for name in names]
+            places = [path_inside(self.root, folder, normpath(name.replace("\\", "/"))) for name in names]
         except DataError:
             raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it") from None
         target = next((place for place in places if place.is_file()), places[0])
@@ -246,8 +249,19 @@ def _rgba(picture: Any) -> np.ndarray:
     return np.array(picture.convert("RGBA"))
 
 
+@contextmanager
+def well_formed(path: Path) -> Iterator[None]:
+    """Turns what a damaged file makes of our assumptions (a text for a number, a missing key) into a DataError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        raise DataError(
+            f"{path}: not built as glTF 2.0 asks ({type(error).__name__}: {error}); export it again"
+        ) from error
+
+
 def read_gltf(path: Path) -> Gltf:
-    """Opens a .glb or .gltf file. Raises DataError unless it is whole and of version 2."""
+    """Opens a .glb or .gltf file, whose other files lie beside it. Raises DataError unless it is whole and of version 2."""
     try:
         data = Path(path).read_bytes()
     except IsADirectoryError:
@@ -263,7 +277,7 @@ def read_gltf(path: Path) -> Gltf:
         raise not_gltf(Path(path)) from None
     if not version.startswith("2"):
         raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")
-    return Gltf(Path(path), tree, binary)
+    return Gltf(Path(path), tree, binary, Path(path).parent)
 
 
 def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes | None]:

@@ -9,14 +9,14 @@ import numpy as np
 
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
-from dpcli.prepare.meshes.gltf_draco import decompress
-from dpcli.prepare.meshes.gltf_extensions import instances
+from dpcli.prepare.meshes.gltf_extensions import decompress, instances
 from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
 from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, node_visibility, read_clip
 from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.runtime.progress import log
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_STILL = Clip("still", 0.0, 0.0, {})
 _BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
 _MOST_VERTICES = 20_000_000  # of all instances of a node
@@ -50,14 +50,12 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     Raises DataError when the file is broken.
     """
     parent = node_parents(file)
-    curves = Clip("still", 0.0, 0.0, {}) if clip is None else read_clip(file, clip)
+    curves = _STILL if clip is None else read_clip(file, clip)
     if curves.passed:
         log.warn(f"{file.path}: clip {curves.name!r} also changes what is not read: {', '.join(curves.passed)}")
     time = curves.sample_times(frames)
     poses, shown = node_poses(file, parent, curves, time), node_visibility(file, parent, curves, time)
-    visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
-    pieces = [piece for node in visible for piece in _read_node(file, node)]
-    pieces = [_turned_out(piece, poses) for piece in pieces if len(piece.triangles)]
+    pieces = _visible_pieces(file, poses, shown)
     if not pieces:
         raise file.fail("has no triangles in its scene; expected a mesh with an animation")
     used = sorted({piece.material for piece in pieces})
@@ -94,9 +92,35 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
     faceted = np.concatenate([np.full(len(piece.triangles), piece.faceted) for piece in pieces])
+    turned = np.stack([_turns(piece, poses) for piece in pieces], axis=1)
     return replace(
-        mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None, faceted=faceted if faceted.any() else None
+        mesh,
+        one_sided=culled & ~_has_twin(mesh) if culled.any() else None,
+        faceted=faceted if faceted.any() else None,
+        turned=turned.repeat([len(piece.triangles) for piece in pieces], axis=1)
+        if culled.any() and turned.any()
+        else None,
     )
+
+
+def shape_at_rest(file: Gltf) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices f32 (V,3) and triangles i64 (T,3) of the scene as it stands, without what shows them: no texture is read."""
+    parent, time = node_parents(file), np.zeros(1)
+    poses, shown = node_poses(file, parent, _STILL, time), node_visibility(file, parent, _STILL, time)
+    pieces = _visible_pieces(file, poses, shown)
+    starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
+    moved = [_move(file, piece, _STILL, time, poses)[0][0] for piece in pieces]
+    triangles = [piece.triangles + start for piece, start in zip(pieces, starts)]
+    return np.concatenate([np.zeros((0, 3), np.float32), *moved]), np.concatenate(
+        [np.zeros((0, 3), np.int64), *triangles]
+    )
+
+
+def _visible_pieces(file: Gltf, poses: np.ndarray, shown: np.ndarray) -> list[_Piece]:
+    """Returns the pieces with triangles of the nodes that are seen at some time, bool shown (T,N), their fronts outwards."""
+    visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
+    pieces = [piece for node in visible for piece in _read_node(file, node)]
+    return [_turned_out(piece, poses) for piece in pieces if len(piece.triangles)]
 
 
 def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -112,12 +136,21 @@ def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) ->
 
 
 def _turned_out(piece: _Piece, poses: np.ndarray) -> _Piece:
-    """Returns the piece with its triangles wound the other way when its node, or first bone, mirrors it."""
+    """Returns the piece with its triangles wound the other way when its node, or first bone, mirrors it where it is largest."""
+    size = _sizes(piece, poses)
+    return replace(piece, triangles=piece.triangles[:, ::-1]) if size[np.abs(size).argmax()] < 0 else piece
+
+
+def _turns(piece: _Piece, poses: np.ndarray) -> np.ndarray:
+    """Returns bool (T): when a node, or first bone, mirrors a piece though it doesn't where it is largest, or the other way."""
+    size = _sizes(piece, poses)
+    return size * size[np.abs(size).argmax()] < 0
+
+
+def _sizes(piece: _Piece, poses: np.ndarray) -> np.ndarray:
+    """Returns (T) how many times as large its node, or first bone, makes a piece, negative where it mirrors it."""
     bone = int(piece.bones[0, piece.weights[0].argmax()])
-    size = np.linalg.det((poses[:, bone] @ piece.inverse_bind[bone])[:, :3, :3])
-    if size[np.abs(size).argmax()] < 0:
-        return replace(piece, triangles=piece.triangles[:, ::-1])
-    return piece
+    return np.linalg.det((poses[:, bone] @ piece.inverse_bind[bone])[:, :3, :3])
 
 
 def _has_twin(mesh: AnimatedMesh) -> np.ndarray:
@@ -133,7 +166,12 @@ def _scene_nodes(file: Gltf) -> list[int]:
     """Returns nodes of the default scene, parents first; all nodes when the file names no scene."""
     if not file.items("scenes"):
         return list(range(len(file.items("nodes"))))
-    order = list(file.item("scenes", file.tree.get("scene", 0)).get("nodes", []))
+    scene = file.item("scenes", number := file.tree.get("scene", 0))
+    if (count := len(file.items("scenes"))) > 1:
+        log.info(
+            f"{file.path}: {count} scenes in it; {number} ({scene.get('name') or 'no name'}) is read, as viewers do"
+        )
+    order = list(dict.fromkeys(scene.get("nodes", [])))
     for index in order:  # grows while it is walked; circles are refused before
         order += file.item("nodes", index).get("children", [])
     return order

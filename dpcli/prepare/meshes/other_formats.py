@@ -7,40 +7,18 @@ import zipfile
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.runtime.clips.other_files import PAGE, POINTER, what_it_is
 
 _BLENDER = "open it in Blender and use File > Export > glTF 2.0"
 _SHAPE = (
     "it holds one shape that stands still; import a series of them into Blender as one animation, and export glTF 2.0"
 )
-_UNPACK = "unpack it, and name the .glb or .gltf in it"
-_AGAIN = "download it again"
-_KINDS = {  # how files begin: what they are, and what to do
-    b"Kaydara FBX Binary": ("FBX", _BLENDER),
-    b"; FBX": ("FBX", _BLENDER),
-    b"FBXHeaderExtension": ("FBX", _BLENDER),
-    b"PXR-USDC": ("USD", _BLENDER),
-    b"#usda": ("USD", _BLENDER),
-    b"BLENDER": ("a Blender file", _BLENDER),
-    b"Ogawa": ("Alembic", _BLENDER),
-    b"\x89HDF": ("HDF5 (Alembic, or a file that dpc made)", f"of Alembic: {_BLENDER}"),
-    b"HIERARCHY": ("BVH, motion without a surface", f"put it on a model: {_BLENDER}"),
-    b"<?xml": ("XML (COLLADA, perhaps)", _BLENDER),
-    b"<COLLADA": ("COLLADA", _BLENDER),
-    b"//Maya ASCII": ("Maya", "export it as glTF 2.0, or as FBX for Blender"),
-    b"FOR4": ("Maya", "export it as glTF 2.0, or as FBX for Blender"),
-    b"FOR8": ("Maya", "export it as glTF 2.0, or as FBX for Blender"),
-    b"\xd0\xcf\x11\xe0": ("3ds Max, perhaps", "export it as glTF 2.0, or as FBX for Blender"),
-    b"b3dm": ("a tile of 3D Tiles", "extract the .glb in it"),
-    b"\x1f\x8b": ("a gzip archive (or a compressed Blender file)", f"unpack it, or {_BLENDER}"),
-    b"\x28\xb5\x2f\xfd": ("a zstd archive (or a compressed Blender file)", f"unpack it, or {_BLENDER}"),
-    b"7z\xbc\xaf\x27\x1c": ("a 7z archive", _UNPACK),
-    b"Rar!": ("a rar archive", _UNPACK),
-    b"\xff\xfe": ("text in UTF-16", "save it as UTF-8"),
-    b"solid": ("STL", _SHAPE),
-    b"ply": ("PLY", f"{_SHAPE}; as points, `dpc prepare clouds` reads a folder of them"),
-    b"<!DOCTYPE html": ("a web page", _AGAIN),
-    b"<html": ("a web page", _AGAIN),
-    b"version https://git-lfs": ("a pointer of Git LFS", "fetch the file itself: git lfs pull"),
+_ADVICE = {  # of what is treated alike
+    **{"model": _BLENDER, "motion": f"put it on a model: {_BLENDER}", "arrays": f"of Alembic: {_BLENDER}"},
+    **{"archive": "unpack it, and name the .glb or .gltf in it", "packed": f"unpack it, or {_BLENDER}"},
+    **{"program": "export it as glTF 2.0, or as FBX for Blender", "tile": "extract the .glb in it"},
+    **{"shape": f"{_SHAPE}; as points, `dpc prepare clouds` reads a folder of PLY", "wide": "save it as UTF-8"},
+    **{"page": PAGE, "pointer": POINTER, "picture": "name a model"},
 }
 _BY_SUFFIX = {  # of formats whose beginning tells nothing
     ".obj": ("OBJ", _SHAPE),
@@ -50,20 +28,19 @@ _BY_SUFFIX = {  # of formats whose beginning tells nothing
     ".fbx": ("FBX", _BLENDER),
     ".drc": ("Draco alone", _SHAPE),
 }
+_START = 512
 _VIDEO = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".gif")
 _MODELS = (".glb", ".gltf", ".vrm")
 
 
 def refuse_other_formats(path: Path, data: bytes) -> None:
-    """Raises DataError when the bytes of a file are those of another format.."""
+    """Raises DataError when the bytes of a file are those of another format."""
     if not data.strip():
         raise DataError(f"{path}: the file is empty; copy or export it again")
     if data.startswith(b"PK\x03\x04"):
         raise DataError(f"{path}: not a glTF file but {_archive(data)}")
-    start = data[:64].lstrip(b"\xef\xbb\xbf \n\r\t").lower()
-    for begin, (what, advice) in _KINDS.items():
-        if start.startswith(begin.lower()):
-            raise DataError(f"{path}: not a glTF file but {what}; {advice}")
+    if what := what_it_is(data[:_START], _ADVICE):
+        raise DataError(f"{path}: not a glTF file but {what}")
 
 
 def not_gltf(path: Path) -> DataError:

@@ -28,6 +28,8 @@ class FrameCaster:
         a, b, c = (self.positions[mesh.triangles[:, k]] for k in range(3))
         plain = mesh.one_sided is None and mesh.faceted is None
         self._across = None if plain else np.cross(b - a, c - a)
+        if not plain and mesh.turned is not None:
+            self._across[mesh.turned[frame]] *= -1
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism

@@ -12,6 +12,7 @@ from typing import Any
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names, path_inside
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
@@ -46,7 +47,8 @@ class Message:
 def is_recording(path: Path) -> bool:
     """Returns whether a path is a recording: a file of its kind, or the folder of a ROS 2 bag."""
     if path.is_dir():
-        return (path / _METADATA).is_file() and any(one.name.lower().endswith(_IN_FOLDERS) for one in path.iterdir())
+        listed = os.path.isfile(path / _METADATA)  # unlike Path's, it says no of a folder that nobody may enter
+        return listed and any(one.name.lower().endswith(_IN_FOLDERS) for one in path.iterdir())
     return path.suffix.lower() in SUFFIXES
 
 
@@ -55,10 +57,10 @@ def find_recordings(path: Path) -> list[Path]:
     if is_recording(path):
         return [path]
     found: list[Path] = []
-    for folder, below, names in os.walk(path):
+    for folder, below, names in walk_folders(path):
         bags = [name for name in below if is_recording(Path(folder, name))]
         found += [Path(folder, name) for name in bags]
-        below[:] = [name for name in below if name not in bags and not is_hidden(name)]
+        below[:] = [name for name in below if name not in bags]
         files = (Path(folder, name) for name in names if name.lower().endswith(SUFFIXES) and not is_hidden(name))
         found += [file for file in files if is_recording(file)]
     return sorted(found, key=lambda one: natural_key(one.relative_to(path).as_posix()))
@@ -70,7 +72,7 @@ def holds_only_recordings(path: Path, others: tuple[str, ...]) -> bool:
         return True
     if not path.is_dir() or not find_recordings(path):
         return False
-    names = (name.lower() for _, _, files in os.walk(path) for name in files if not is_hidden(name))
+    names = (name.lower() for _, _, files in walk_folders(path) for name in files if not is_hidden(name))
     return not any(name.endswith(others) and not is_beside(name) for name in names)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from os.path import splitext
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_hidden
 
@@ -27,6 +27,11 @@ _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
 )
+_ADVICE = {
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "unpack them"),
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
+    ".e57": "save their points as .ply, such as with CloudCompare",
+}
 
 
 def find_sequences(
@@ -47,7 +52,7 @@ def find_sequences(
             found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        advice = f"; found {', '.join(_counted(others))}: save their points as .ply" if others else ""
+        advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else ""
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
     return _without_logs(
         root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses
@@ -71,6 +76,18 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[
     return [replace(first, left_out=(*first.left_out, *named)), *others]
 
 
+def refuse_foreign_file(path: Path) -> None:
+    """Raises DataError where a file is of a format that is not read, and says what to do with it."""
+    suffix = path.suffix.lower()
+    if suffix in _FOREIGN and path.is_file():
+        raise DataError(f"{path}: {suffix} files are not read: {_advice([suffix])}, and name their folder or table")
+
+
+def _advice(suffixes: Iterable[str]) -> str:
+    told = dict.fromkeys(_ADVICE.get(suffix, "save their points as .ply") for suffix in suffixes)
+    return ", or ".join(told)
+
+
 def _counted(foreign: Counter[str]) -> tuple[str, ...]:
     return tuple(f"{count} {suffix} file{'s' if count > 1 else ''}" for suffix, count in sorted(foreign.items()))
 
@@ -79,8 +96,7 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
     """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
     are not read, by suffix; no folder that has neither.
     """
-    for folder, below, names in os.walk(root):
-        below[:] = [name for name in below if not is_hidden(name)]
+    for folder, _, names in walk_folders(root):
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]

@@ -2,55 +2,30 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.column_names import find_frame_column, words_of
+from dpcli.prepare.cloud_formats.column_names import find_frame_column
+from dpcli.prepare.reader import natural_key
+from dpcli.prepare.scans.times_of_tables import Clock, Table, clock_seconds, seconds_and_parts, seconds_of
 
-_SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
-_TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
 SINGLE = (
     "sequences whose frames hold one point each; does the frame column tell the time of each point? (--frame-column)"
 )
 FELL = "sequences whose frame numbers fall on the way, put in the order of the numbers (--gap N begins a new sequence there)"
 WRAPPED = "sequences whose frame numbers begin anew at 0 when their counter is full; their frames stay in their order"
+_EXACT = 2**53  # up to here every whole number is a float64
 _FULL = (2**8, 2**16, 2**32)  # what a counter of 8, 16 or 32 bits never reaches
-_CLOCK = re.compile(
-    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*)?(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
-    re.IGNORECASE,
-)
-_DAY = 86_400.0
 JOINED = "frames whose rows were joined, as their numbers come again later (--gap N begins a new sequence there)"
-
-
-class Table(Protocol):
-    """Offers the columns of a table, as `text_numbers.TextTable` and `parquet.ParquetTable` do."""
-
-    path: Path
-    names: tuple[str, ...]
-
-    def columns(self, places: list[int]) -> np.ndarray:
-        """Returns some columns as numbers f64 (N,k)."""
-        ...
-
-    def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as text."""
-        ...
 
 
 @dataclass(frozen=True)
 class Rows:
     """Holds one sequence of a table. name: what is added to the table's, "" where it has one only; rows: i64 (N), frame
-    after frame; offsets: i64 (T+1); frames: what the frame column holds, f64 (T), None for words; clock: it holds times of
-    day, here in seconds; joined: how many frames lay in several places; notes: what is odd about their numbers.
+    after frame; offsets: i64 (T+1); frames: what the frame column holds, f64 or i64 (T), None for words; clock: it holds times, here
+    in seconds; joined: how many frames lay in several places; notes: what is odd about their numbers.
     """
 
     name: str
@@ -72,51 +47,10 @@ class Rows:
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
         return since / max(int(step), 1) / fps if fps else None
 
-
-def seconds_of(column: str, values: np.ndarray) -> float:
-    """Returns how many seconds one unit of a column is that holds times; 0 where its values f64 (T) count frames.
-
-    >>> seconds_of("frame", np.array([1.0, 2.0])), seconds_of("t_ms", np.array([0.0, 33.0]))
-    (0.0, 0.001)
-    """
-    words = words_of(column)
-    if len(words) > 1 and words[-1] in _SECONDS:
-        return _SECONDS[words[-1]]
-    whole = (values == np.floor(values)).all()
-    digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
-    if whole and len(digits) == 1 and set(words) & _TIME_WORDS:
-        return _EPOCHS.get(digits.pop(), 0.0)
-    return 0.0 if whole else 1.0
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Holds the seconds f64 (N) of each row of a table, as a column told them that doesn't number the frames."""
-
-    column: str
-    seconds: np.ndarray
-
-    def times(self, part: Rows) -> np.ndarray | None:
-        """Returns seconds since the first frame, f64 (T), of a frame's earliest row; None where they don't rise."""
-        starts = np.minimum.reduceat(self.seconds[part.rows], part.offsets[:-1])
+    def times_by(self, clock: Clock) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (T), of a frame's earliest row by a clock; None where they don't rise."""
+        starts = np.minimum.reduceat(clock.seconds[self.rows], self.offsets[:-1])
         return starts - starts[0] if (np.diff(starts) > 0).all() else None
-
-
-def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:
-    """Returns the times that some of the columns ``names`` tell, in seconds or of a unit in the column's name."""
-    found = []
-    for name in names:
-        if not set(words_of(name)) & _TIME_WORDS:
-            continue
-        try:
-            values = table.columns([table.names.index(name)])[:, 0]
-        except DataError:
-            values, unit = np.array(clock_seconds(table.words(table.names.index(name)))), 1.0
-        else:
-            unit = seconds_of(name, values) if np.isfinite(values).all() else 0.0
-        if unit and len(values):
-            found.append(Clock(name, (values - values[0]) * unit))
-    return found
 
 
 def frame_column(table: Table, wanted: str) -> str:
@@ -153,61 +87,58 @@ def split_rows(table: Table, column: str, sequence_column: str = "", gap: float 
 
 
 def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | None, bool]:
-    """Returns what orders the rows (numbers, or places of words in the order they first occur), the numbers, and whether
-    these are seconds that the words told as dates or times of day.
+    """Returns what orders the rows (numbers, or places of words), the numbers, and whether these are seconds, as columns of
+    times, dates and times of day tell them.
     """
     place = table.names.index(column)
-    try:
-        values = table.columns([place])[:, 0]
-    except DataError:
-        words = table.words(place)
-        order = {word: k for k, word in enumerate(dict.fromkeys(words))}
-        if seconds := clock_seconds(list(order)):
-            told = np.array([seconds[order[word]] for word in words])
-            return told, told, True
-        return np.array([order[word] for word in words]), None, False
-    bad = np.flatnonzero(~np.isfinite(values))
+    moments = table.moments(place)
+    if moments is None and (clock := seconds_and_parts(table, column)):
+        moments = clock.seconds
+    if moments is None:
+        try:
+            values = table.columns([place])[:, 0]
+        except DataError:
+            return _values_of_words(table, column, table.words(place))
+    else:
+        values = moments
+    _require_all(table, column, np.isfinite(values))
+    if moments is None and len(values) and np.abs(values).max() >= _EXACT:
+        values = _exact(table.words(place), values)
+    return values, values, moments is not None
+
+
+def _values_of_words(table: Table, column: str, words: list[str]) -> tuple[np.ndarray, np.ndarray | None, bool]:
+    """Returns what `_frame_values` does of a column of words: dates are in the order of time, other words in that in which
+    they come, unless that is the alphabet's: then their numbers count.
+    """
+    _require_all(table, column, np.array([word != "" for word in words]))
+    order = list(dict.fromkeys(words))
+    if seconds := clock_seconds(order):
+        moments = dict(zip(order, seconds))
+        told = np.array([moments[word] for word in words])
+        return told, told, True
+    if order == sorted(order):
+        order.sort(key=natural_key)
+    places = {word: k for k, word in enumerate(order)}
+    return np.array([places[word] for word in words]), None, False
+
+
+def _require_all(table: Table, column: str, filled: np.ndarray) -> None:
+    bad = np.flatnonzero(~filled)
     if len(bad):
         raise DataError(f"{table.path}: {len(bad)} rows, the first is {bad[0] + 1}, have no number in {column!r}")
-    return values, values, False
 
 
-def clock_seconds(words: Sequence[str]) -> list[float]:
-    """Returns the seconds of dates with times of day, or of times of day alone, which may pass midnight; [] of other words.
-
-    >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["a"])
-    ([86399.5, 86400.0], [])
+def _exact(words: list[str], values: np.ndarray) -> np.ndarray:
+    """Returns whole numbers as they are written, i64 (N): beyond 2^53 floats are the same for several of them. Others stay
+    the floats ``values``.
     """
-    found: list[float] = []
-    days = 0
-    for word in words:
-        match = _CLOCK.fullmatch(word.strip())
-        try:
-            seconds = _seconds_told(match) if match else None
-        except ValueError:  # such as a month 13
-            seconds = None
-        if match is None or seconds is None:
-            return []
-        if match[1] is None:
-            days += bool(found) and seconds + days * _DAY < found[-1] - _DAY / 2
-        found.append(seconds + days * _DAY)
-    return found
-
-
-def _seconds_told(match: re.Match[str]) -> float:
-    year, month, day, hour, minute, second, fraction, _ = match.groups()
-    own = int(hour) * 3600 + int(minute) * 60 + int(second) + float((fraction or ".0").replace(",", "."))
-    if year is None:
-        return own
-    return datetime(int(year), int(month), int(day), tzinfo=timezone.utc).timestamp() + own - _offset(match[8])
-
-
-def _offset(zone: str | None) -> float:
-    """Returns the seconds by which a zone such as ``+02:00`` is ahead."""
-    if not zone or zone[0] not in "+-":
-        return 0.0
-    ahead = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
-    return float(-ahead if zone[0] == "-" else ahead)
+    try:
+        numbers = [int(word) for word in words]
+        least = min(numbers) if max(numbers) >= 2**63 else 0
+        return np.array([number - least for number in numbers], np.int64)
+    except (ValueError, OverflowError):
+        return values
 
 
 def _groups(table: Table, column: str, count: int) -> list[tuple[str, np.ndarray]]:

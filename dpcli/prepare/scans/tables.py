@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
@@ -17,10 +16,12 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import read_text_table
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Clock, Rows, find_clocks, frame_column, split_rows
+from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
+from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.store.schema import kept_name
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
@@ -164,11 +165,11 @@ class TableSequences:
             loaded = self._load(good.path)
             first = loaded.parts[0]
             used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
-            clock = used.column if used else ""
-            unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, clock))
+            clock = used.columns if used else ()
+            unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, *clock))
             lines[0] += f", frames by column {loaded.column!r}"
             if clock:
-                lines[0] += f", times by column {clock!r}"
+                lines[0] += f", times by column {' and '.join(map(repr, clock))}"
             lines[0] += f"; not read: {unused} (--keep-fields)" if unused else ""
         return lines + (self._label_table.unnamed(items) if self._label_table else [])
 
@@ -189,11 +190,11 @@ class Loaded:
         """Returns seconds since the first frame, f64 (T): by the frame column or ``fps``, else by a clock; else None."""
         told = part.times(self.column, fps)
         clock = self.clock(part) if told is None else None
-        return clock.times(part) if clock else told
+        return part.times_by(clock) if clock else told
 
     def clock(self, part: Rows) -> Clock | None:
         """Returns the first clock whose times rise from frame to frame of a sequence; None without one."""
-        return next((one for one in self.clocks if one.times(part) is not None), None)
+        return next((one for one in self.clocks if part.times_by(one) is not None), None)
 
     def frames(self, part: Rows) -> list[Cloud]:
         """Returns the frames of one sequence."""
@@ -221,7 +222,7 @@ def _load(
 
 
 def _tables_below(folder: Path) -> Iterator[Path]:
-    for place, folders, names in os.walk(folder):
+    for place, folders, names in walk_folders(folder):
         folders.sort(key=natural_key)
         for name in sorted(names, key=natural_key):
             if name.lower().endswith(TABLES) and not name.startswith("."):

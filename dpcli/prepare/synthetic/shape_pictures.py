@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
 from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
 from dpcli.prepare.synthetic.creature_mesh import animated_creature, make_skin
 from dpcli.prepare.synthetic.gait import bone_motion
 from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
+from dpcli.regular_files import why_unreadable
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.text_files import read_text
@@ -102,7 +103,7 @@ def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[Mesh
     """
     paths = [path for place in places for path in _models_in(place)]
     if held_out and not Path(held_out).is_file():
-        raise UsageError(f"--held-out {held_out}: no such file")
+        raise DataError(f"--held-out {held_out}: {why_unreadable(held_out) or 'no such file'}")
     text = read_text(Path(held_out)) if held_out else ""
     ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
     for end in ends:
@@ -120,7 +121,7 @@ def _models_in(place: Path) -> list[Path]:
     if place.is_file():
         return [place]
     if not place.is_dir():
-        raise DataError(f"{place}: no such file or folder")
+        raise DataError(f"{place}: {why_unreadable(place) or 'no such file or folder'}")
     found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
     if not found:
         raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")

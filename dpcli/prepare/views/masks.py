@@ -25,8 +25,8 @@ _SAID: set[str] = set()
 def read_mask(path: Path) -> np.ndarray:
     """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of labels isn't 0.
 
-    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits. Raises DataError when
-    the file isn't readable, or when compression changed its labels.
+    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits, and so is an alpha that
+    nowhere reaches 255. Raises DataError when the file isn't readable, or when compression changed its labels.
     """
     try:
         with open_image(path) as stored:
@@ -35,14 +35,37 @@ def read_mask(path: Path) -> np.ndarray:
             if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
                 alpha = np.array(image.convert("RGBA").getchannel("A"))
                 if alpha.min(initial=255) < 255:
-                    return alpha
-            if image.mode in ("P", "1"):
+                    return _opaque(alpha > 0) if alpha.max() < 255 and _are_labels(alpha) else alpha
+            if image.mode == "1":
                 return _opaque_labels(path, np.array(image))
+            if image.mode == "P":
+                return _of_palette(path, image)
             wide = image.mode[0] in "IF"
             values = np.array(image if wide else image.convert("RGB"))
     except (OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path}: not a readable mask ({error}); export it again") from None
     return _of_colors(path, values, lossy) if values.ndim == 3 else _of_values(path, values, lossy)
+
+
+def _of_palette(path: Path, image) -> np.ndarray:  # image: PIL.Image.Image
+    """Returns the mask u8 (H,W) of an image with a palette: by its numbers where 0 is the background, else by its colors.
+
+    Tools for labels give 0 to the background. Programs that make files smaller number colors as they like: then shades of
+    gray are a mask as it is drawn, and black is the background of other colors.
+    """
+    numbers, colors = np.array(image), np.array(image.convert("RGB"))
+    used, first = np.unique(numbers, return_index=True)
+    shown = colors.reshape(-1, 3)[first].astype(int)
+    if not np.ptp(shown, axis=1).any() and len(np.unique(shown[:, 0])) == len(used):
+        return _of_values(path, colors[..., 0], False)
+    black = ~shown.any(1)
+    if black.any() and used[0] == 0 and not black[0]:
+        with log.each_once(_SAID):
+            log.info(
+                f"{path.parent}: masks: number 0 of a palette is a color and black has another; black is the background"
+            )
+        return _opaque(colors.any(-1))
+    return _opaque_labels(path, numbers)
 
 
 def _is_lossless(path: Path) -> bool:

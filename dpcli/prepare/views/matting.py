@@ -230,7 +230,8 @@ def with_alpha(rgba: np.ndarray, alpha: np.ndarray, mask: str, name: str) -> np.
     """
     if alpha.shape != rgba.shape[:2]:
         found, expected = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, rgba.shape))
-        raise DataError(f"{mask}: the mask is {found}, its frame {name} is {expected}; expected the same size")
+        turned = ", turned as its EXIF asks for" if alpha.shape == rgba.shape[1::-1] else ""
+        raise DataError(f"{mask}: the mask is {found}, its frame {name} is {expected}{turned}; expected the same size")
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     if (border > 127).mean() > 0.9 and (alpha <= 127).any():
         raise DataError(f"{mask}: the mask covers the whole border: inverted? White (255) has to be the object")

@@ -12,6 +12,7 @@ from dpcli.errors import DataError
 
 OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits the default camera's picture
 _NEAREST = 1e-6  # of the scene's size: what is nearer lies in a camera
+_SAME, _TURNED = 1e-3, 0.1  # of the scene's size: cameras in one place; and radians: what they are turned by there
 _PARALLEL = 0.01  # how much shorter than 1 the mean of rays is that go one way
 
 
@@ -87,6 +88,17 @@ def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, f
     return center, float(np.sqrt(((flat - center) ** 2).sum(axis=1).max()))
 
 
+def _require_places(poses: np.ndarray) -> None:
+    """Raises DataError for cameras that stand in one place and are turned differently, as those of inverted poses do."""
+    centers, turned = camera_centers(poses), poses[:, :3, :3] @ poses[0, :3, :3].T
+    angles = np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    if np.ptp(centers, axis=0).max() <= _SAME * np.abs(centers).max() and angles.max() > _TURNED:
+        raise DataError(
+            f"its {len(poses)} cameras stand in one place, turned differently; expected poses of the cameras in the world"
+            " (camera to world), are they inverted?"
+        )
+
+
 def _in_front(center: np.ndarray, poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Returns the center f64 (3) of an object; one that isn't before all cameras is put there where no ray tells how far it is.
 
@@ -110,6 +122,7 @@ def sphere_of_silhouettes(
 
     The center is the point nearest to the rays through the boxes' middles (for parallel rays: nearest to the world's
     origin besides, or somewhere before the cameras); the radius is the largest extent of a box around it, at its depth.
+    Raises DataError where poses can't be those of cameras around an object.
     """
     centers = camera_centers(poses)
     middles = np.array([((left + right) / 2, (top + bottom) / 2, 1) for left, top, right, bottom in boxes])
@@ -118,6 +131,7 @@ def sphere_of_silhouettes(
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     system = across.sum(axis=0) + 1e-6 * np.eye(3)
     center = _in_front(np.linalg.solve(system, np.einsum("vij,vj->i", across, centers)), poses, rays)
+    _require_places(poses)
     radius = 0.0
     for camera, pose, (left, top, right, bottom) in zip(intrinsics, poses, boxes, strict=True):
         seen = pose[:3, :3] @ center + pose[:3, 3]

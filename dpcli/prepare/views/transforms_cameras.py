@@ -25,9 +25,10 @@ _LENS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h
 _POSITIVE = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _DISTORTION += (*(f"ftheta_p{place}" for place in range(5)), "latlong", "rolling_shutter", "orthographic")
+_DISTORTION += ("distortion_params", "distortion", "distortion_coefficients", "dist_coeffs", "k", "p")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
-_LAST_TIME = 1e9  # in any unit
+_LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
@@ -67,6 +68,10 @@ class View:
                 "expected pixels, not shares of the picture or millimeters"
             )
         cx, cy = lens.get("cx", 0.5 * width / across), lens.get("cy", 0.5 * height / down)
+        if 0 < cx <= 1 and 0 < cy <= 1 and min(width / across, height / down) > 2:
+            raise DataError(
+                f"{place.parent}: a principal point at {cx:g}, {cy:g}; expected pixels, not shares of the picture"
+            )
         return np.array([[fx * across, 0, cx * across], [0, fy * down, cy * down], [0, 0, 1.0]])
 
 

@@ -127,7 +127,7 @@ def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:
     values, rate = np.array(times) - times[0], fps or FOLDER_FPS
     if len(values) == 1:
         return values
-    ends = f"{path}: times {times[0]:g} to {times[-1]:g} are taken for"
+    ends = f"{path}: times {times[0]:.10g} to {times[-1]:.10g} are taken for"
     if max(times) > 1 and (values == np.floor(values)).all():
         log.info(f"{ends} numbers of frames, {rate:g} per second (--fps)")
         return values / np.gcd.reduce(values.astype(np.int64)) / rate

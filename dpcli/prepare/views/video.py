@@ -14,6 +14,7 @@ from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import (
     FOLDER_FPS,
+    PICTURE_FOLDERS,
     Frames,
     image_paths,
     image_size,
@@ -34,7 +35,6 @@ _LISTED = 8
 _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
 _OBJECT = 0.2  # of the largest piece: one that large, apart from it, is another object
 _ANNOTATIONS = (".json", ".txt", ".xml", ".npy", ".npz")  # of LabelMe, YOLO, CVAT, SAM
-_NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +119,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
 def clip_name(path: Path) -> str:
     """Returns the file's or folder's name, or that of the folder above when it says nothing (`minions/rgba`)."""
     path = path.resolve()
-    return path.parent.name if path.is_dir() and path.name.lower() in _NO_NAMES else path.stem
+    return path.parent.name if path.is_dir() and path.name.lower() in PICTURE_FOLDERS else path.stem
 
 
 def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:

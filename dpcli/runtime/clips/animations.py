@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.container_ends import pictures_in
 from dpcli.runtime.clips.gif_pictures import check_canvas, gif_canvases
 from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.video_frames import video_frames
+from dpcli.runtime.progress import log
 
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
 _SHORTEST, _INSTEAD = 10.0, 100.0  # ms: what is shown so long or less browsers show for a tenth of a second
@@ -52,6 +54,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
         raise DataError(f"{path}: {len(times)} pages, which tell no times; write each into a folder as an image")
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
+    if (behind := pictures_in(path) - len(times)) > 0:
+        log.warn(f"{path}: {behind} pictures lie behind the {len(times)} that its header counts, and are left out")
     return tuple(times)
 
 

@@ -12,6 +12,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+# Files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened.
+VIDEO_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
+    "dv,mxf,nut,apng,mjpeg,swf,rm"
+)
 _SEGMENT = b"\x18\x53\x80\x67"  # of Matroska and WebM: all but the header
 _NUT_INDEX = bytes.fromhex("4e58dd672f23e64e")
 _ASF_HEAD, _ASF_FILE = bytes.fromhex("3026b2758e66cf11"), bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
@@ -59,6 +64,24 @@ def promised_frames(path: Path) -> int:
     if not re.match(rb"RIFF.{4}AVI LIST.{8}avih", head, re.DOTALL) or len(head) < 64:
         return 0
     return int.from_bytes(head[48:52], "little") if int.from_bytes(head[56:60], "little") == 1 else 0
+
+
+def pictures_in(path: Path) -> int:
+    """Returns how many pictures lie in an APNG or animated WebP, whatever its header counts; 0 for other files."""
+    found, size = 0, os.path.getsize(path)
+    with path.open("rb") as file:
+        start = file.read(12)
+        png = start.startswith(b"\x89PNG")
+        if not png and start[8:] != b"WEBP":
+            return 0
+        at = 8 if png else 12
+        while at + 8 <= size:
+            file.seek(at)
+            one, two = file.read(4), file.read(4)
+            name, length = (two, int.from_bytes(one, "big") + 4) if png else (one, int.from_bytes(two, "little"))
+            found += name in (b"fcTL", b"ANMF")
+            at += 8 + length + (length % 2 if not png else 0)
+    return found
 
 
 def _goes_on(ends: Iterator[int], size: int) -> bool:

@@ -1,6 +1,6 @@
 """Margins that a video file hides: those around the clean aperture of MP4 and QuickTime, PixelCrop of Matroska.
 
-FFmpeg's decoders leave it to whoever shows them, and PyAV doesn't tell it.
+FFmpeg's decoders leave it to whoever shows them, and PyAV doesn't tell it, nor other boxes that describe a video.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import BinaryIO
 Margins = tuple[int, int, int, int]  # left, right, top, bottom: pixels that aren't shown
 
 _NONE: Margins = (0, 0, 0, 0)
+_FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _IN_TRACK = (b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY, _SAMPLE_TABLE = 86, 16  # bytes before the boxes in a video's sample entry, and before those entries
 _SEGMENT, _TRACKS, _TRACK, _VIDEO = 0x18538067, 0x1654AE6B, 0xAE, 0xE0
@@ -28,7 +29,7 @@ def margins(path: Path, place: int, size: tuple[int, int]) -> Margins:
     with path.open("rb") as file:
         end = os.path.getsize(path)
         head = file.read(12)
-        if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
+        if head[4:8] in _FIRST:
             found = _of_boxes(file, end, place, size)
         elif head[:4] == b"\x1aE\xdf\xa3":
             found = _of_matroska(file, end, place)
@@ -54,10 +55,23 @@ def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, i
         start += length
 
 
-def _of_boxes(file: BinaryIO, end: int, place: int, size: tuple[int, int]) -> Margins:
+def entry_box(path: Path, place: int, names: tuple[bytes, ...]) -> bytes:
+    """Returns the first box of these names that describes the video at this place (0: the first) of an MP4 or QuickTime file,
+    without its head; nothing where there is none.
+    """
+    with path.open("rb") as file:
+        entries = list(_entries(file, os.path.getsize(path))) if file.read(8)[4:] in _FIRST else []
+        for name, start, stop in _boxes(file, *entries[place]) if place < len(entries) else ():
+            if name in names:
+                file.seek(start)
+                return file.read(min(stop - start, _MOST))
+    return b""
+
+
+def _entries(file: BinaryIO, end: int) -> Iterator[tuple[int, int]]:
+    """Yields where the boxes that describe each video of a file begin and end."""
     movie = next(((start, stop) for name, start, stop in _boxes(file, 0, end) if name == b"moov"), None)
     tracks = [(start, stop) for name, start, stop in _boxes(file, *movie) if name == b"trak"] if movie else []
-    apertures = []
     for part in tracks:
         parts = {b"trak": part}
         for above, name in zip((b"trak", *_IN_TRACK), _IN_TRACK):
@@ -66,9 +80,14 @@ def _of_boxes(file: BinaryIO, end: int, place: int, size: tuple[int, int]) -> Ma
             continue
         start = parts[b"stsd"][0] + _SAMPLE_TABLE - 8
         entry = next(_boxes(file, start, parts[b"stsd"][1]), (b"", 0, 0))
-        clap = next((at for name, at, _ in _boxes(file, entry[1] - 8 + _ENTRY, entry[2]) if name == b"clap"), None)
-        apertures.append(_aperture(file, clap, size) if clap else _NONE)
-    return apertures[place] if place < len(apertures) else _NONE
+        yield entry[1] - 8 + _ENTRY, entry[2]
+
+
+def _of_boxes(file: BinaryIO, end: int, place: int, size: tuple[int, int]) -> Margins:
+    entries = list(_entries(file, end))
+    found = _boxes(file, *entries[place]) if place < len(entries) else ()
+    clap = next((at for name, at, _ in found if name == b"clap"), None)
+    return _aperture(file, clap, size) if clap else _NONE
 
 
 def _aperture(file: BinaryIO, at: int, size: tuple[int, int]) -> Margins:

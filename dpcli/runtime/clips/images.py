@@ -18,7 +18,10 @@ from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.color_tags import color_tags
 from dpcli.runtime.progress import log
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif")
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif"),
+    *(".jfif", ".tga", ".jp2", ".ppm"),
+)
 _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds

@@ -18,21 +18,15 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
-from dpcli.runtime.clips.cropping import Margins, margins
-from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix
+from dpcli.runtime.clips.container_ends import VIDEO_FORMATS, empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.cropping import Margins, entry_box, margins
+from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix, more_than_a_picture
 from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg"),
     *(".wmv", ".flv", ".ogv", ".3gp", ".y4m", ".asf", ".mxf", ".vob", ".dv", ".mjpg", ".mjpeg"),
-)
-# Formats of playlists aren't among them: they name other files, which nobody meant to be read.
-# files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
-VIDEO_FORMATS = (
-    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
-    "dv,mxf,nut,apng,mjpeg,swf,rm"
 )
 _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
@@ -51,11 +45,15 @@ _ASKEW = 0.02  # of a display matrix: a degree
 
 @dataclass(frozen=True)
 class VideoLook:
-    """Tells of a video what one pass finds: its number of frames, their seconds or None, and whether alpha shows."""
+    """Tells of a video what one pass finds: its number of frames, their seconds or None, and whether alpha shows.
+
+    An alpha that is 0 everywhere is none: programs that record four bytes a pixel may leave the fourth empty.
+    """
 
     count: int
     times: tuple[float, ...] | None
     has_alpha: bool
+    is_empty: bool = False  # its alpha, everywhere
 
 
 def look_at_video(path: Path) -> VideoLook:
@@ -75,25 +73,33 @@ def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) 
     """
     container, stream = _open(path)
     with closing(container):
-        frames, matrix = enumerate(_decoded(path, container, stream)), None
+        frames, matrix, empty = enumerate(_decoded(path, container, stream)), None, False
         hidden = _margins(path, container, stream)
         for index in wanted:
             frame = next((frame for at, frame in frames if at == index), None)
             if frame is None:
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
-            matrix = matrix or display_matrix(frame)  # one for all of them
-            yield as_it_plays(_rgba(frame, stream.sample_aspect_ratio, hidden, as_stored), matrix)
+            if matrix is None:  # one for all of them
+                matrix = display_matrix(frame)
+                empty = _has_alpha(frame) and not as_stored and look_at_video(path).is_empty
+            picture = _rgba(frame, stream.sample_aspect_ratio, hidden, as_stored)
+            if empty:
+                picture[..., 3] = 255
+            yield as_it_plays(picture, matrix)
 
 
 @lru_cache(maxsize=4)
 def _look(path: Path, changed: int, size: int) -> VideoLook:
     container, stream = _open(path)
     with closing(container):
-        stamps, first, failed, alpha = [], None, False, False
+        stamps, first, failed, alpha, seen = [], None, False, False, False
         bare = container.format.name in _BARE
         try:
             for frame in _decoded(path, container, stream):
-                first, alpha = first or frame, alpha or _is_transparent(frame)
+                first = first or frame
+                if _has_alpha(frame) and not (alpha and seen):
+                    low, high = _ends_of_alpha(frame)
+                    alpha, seen = alpha or low < 255, seen or high > 0
                 # Frames that the decoder held back until the end know no time base of their own.
                 stamps.append(0.0 if bare or frame.pts is None else float(frame.pts * stream.time_base))
         except DataError:
@@ -107,7 +113,7 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
             rate = 0.0  # frames are repeated: their own time stamps tell when, or nothing does
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
-        _require_known_colors(path, first)
+        _require_known_colors(path, container, stream, first)
         _require_one_layer(path, stream)
         _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
@@ -115,12 +121,17 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         if left + right + top + bottom:
             shown = f"{first.width - left - right}x{first.height - top - bottom} of {first.width}x{first.height}"
             log.info(f"{path}: its margins are cut off, as it plays: {shown}")
-    return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
+        if alpha and not seen:
+            log.info(f"{path}: its alpha is 0 everywhere, which is none; read as opaque")
+    return VideoLook(
+        len(stamps), None if times is None else tuple(times.tolist()), alpha and seen, is_empty=alpha and not seen
+    )
 
 
-def _is_transparent(frame) -> bool:  # av.VideoFrame
-    """Returns whether any pixel can be seen through: some writers fill an alpha channel that nobody asked for."""
-    return _has_alpha(frame) and bool(_levels(frame, frame.width, {})[..., 3].min() < 255)
+def _ends_of_alpha(frame) -> tuple[int, int]:  # av.VideoFrame
+    """Returns the least and the greatest alpha: some writers fill a channel that nobody asked for, with 255 or with 0."""
+    alpha = _levels(frame, frame.width, {})[..., 3]
+    return int(alpha.min()), int(alpha.max())
 
 
 def _has_alpha(frame) -> bool:
@@ -167,9 +178,7 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     context.thread_type = "AUTO"
     context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
-    # A packet without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
-    packets = (packet for packet in container.demux(stream) if packet.size)
-    for packet in chain(packets, [None]):
+    for packet in chain(_packets_with_bytes(path, container, stream), [None]):
         try:
             frames = context.decode(packet)
         except av.FFmpegError as error:
@@ -179,6 +188,19 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
         for frame in frames:
             begun = True
             yield frame
+
+
+def _packets_with_bytes(path: Path, container, stream) -> Iterator:  # of av.Packet
+    """Yields the packets of a stream. DataError where what lies between two of them is damaged.
+
+    One without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
+    """
+    import av
+
+    try:
+        yield from (packet for packet in container.demux(stream) if packet.size)
+    except av.FFmpegError as error:
+        raise DataError(f"{path}: no frame begins where one should ({error.strerror}); copy the video again") from None
 
 
 def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
@@ -277,9 +299,19 @@ def lasts(times: np.ndarray, duration: float) -> bool:
     return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
 
 
-def _require_known_colors(path: Path, frame) -> None:
-    """Raises DataError at colors in a space that isn't converted here, such as YCgCo of screen recorders."""
+def _require_known_colors(path: Path, container, stream, frame) -> None:
+    """Raises DataError at colors in a space that isn't converted here, such as YCgCo of screen recorders.
+
+    Dolby Vision of profile 5 has colors of its own, and no tag says so: its configuration names its profile in the third
+    byte, before the bit that ends it.
+    """
     tag = int(frame.colorspace)
+    place = [one.index for one in container.streams.video].index(stream.index)
+    if entry_box(path, place, (b"dvcC", b"dvvC"))[2:3] in (b"\x0a", b"\x0b"):
+        raise DataError(
+            f"{path}: Dolby Vision of profile 5, whose colors only its own players show; ffmpeg -i IN -vf libplacebo OUT "
+            "converts it, or export it as HLG or SDR"
+        )
     if tag in _UNKNOWN_MATRICES and not frame.format.is_rgb and not frame.format.name.startswith("gray"):
         raise DataError(
             f"{path}: its colors are {_UNKNOWN_MATRICES[tag]}; expected RGB, or YCbCr of BT.601, 709 or 2020; "
@@ -325,6 +357,10 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.warn(
             f"{path}: its display matrix turns it by {abs(np.degrees(np.arctan2(b, a))):.0f} degrees, of which only quarter "
             "turns are applied; ffmpeg -i IN OUT turns it"
+        )
+    if more := more_than_a_picture(frame):
+        log.warn(
+            f"{path}: {more}, as the file says; all of each frame is read as one picture: cut out a plain one first"
         )
     if frame.interlaced_frame:
         log.warn(f"{path}: interlaced: each frame shows two moments, line by line; ffmpeg -vf bwdif parts them")

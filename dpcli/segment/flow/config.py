@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import WIDEST, check, setting
 from dpcli.runtime.settings.stored import from_json
 
 
@@ -19,12 +19,15 @@ class FlowConfig:
     Lengths are in diameters of the object.
     """
 
-    local: tuple[int, int] = setting((24, 48), "Channels of the levels of N/2 and N/4 points.", least=1)
+    local: tuple[int, int] = setting((24, 48), "Channels of the levels of N/2 and N/4 points.", least=1, most=WIDEST)
     deep: tuple[int, int] = setting(
-        (64, 96), "Channels of the levels of N/8 and N/16 points, which the global match compares.", least=1
+        (64, 96),
+        "Channels of the levels of N/8 and N/16 points, which the global match compares.",
+        least=1,
+        most=WIDEST,
     )
-    hidden: int = setting(64, "Width of the gated recurrent unit.", least=1)
-    head: int = setting(48, "Width of the layers that regress the flow.", least=1)
+    hidden: int = setting(64, "Width of the gated recurrent unit.", least=1, most=WIDEST)
+    head: int = setting(48, "Width of the layers that regress the flow.", least=1, most=WIDEST)
     neighbors: int = setting(16, "Neighbors that a set convolution looks at.", least=1, most=2048)
     correlated: int = setting(
         8, "Nearest points of the other frame that a warped point is compared with.", least=1, most=2048

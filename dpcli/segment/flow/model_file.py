@@ -26,7 +26,7 @@ def save_flow_model(path: Path, model: FlowStep3D, notes: dict) -> None:
 
 
 def find_flow_model(name: str | Path) -> Path:
-    """Returns the weights file that a name means, as `find_weights`; none comes with the package. Raises UsageError."""
+    """Returns the weights file that a name means, as `find_weights`; none comes with the package. Raises DataError."""
     return find_weights(name, None, _MAKER, "--flow")
 
 

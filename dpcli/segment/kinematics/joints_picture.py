@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.draw.palette import part_colors
 from dpcli.draw.points import Raster, draw_balls
-from dpcli.draw.sheet import save_picture, text_font
+from dpcli.draw.sheet import save_picture, text_font, write_line
 from dpcli.draw.view import turntable_view
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree
 from dpcli.store.joints import FIXED, PRISMATIC, REVOLUTE, TYPES
@@ -26,7 +26,7 @@ def joints_picture(path: Path, tree: KinematicTree, title: str) -> None:
     lines = _legend_lines(tree)
     sheet = Image.new("RGB", (len(_VIEWS) * _CELL, _CELL + _LINE * (len(lines) + 2)), _PAPER)
     draw = ImageDraw.Draw(sheet)
-    draw.text((8, 4), title, fill=_INK, font=text_font(13))
+    write_line(draw, (8, 4), title, sheet.width - 16, _INK)
     for column, azimuth in enumerate(_VIEWS):
         matrix = turntable_view(azimuth, np.radians(25), "z")
         seen = points @ matrix.T

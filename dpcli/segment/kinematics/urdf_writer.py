@@ -13,6 +13,7 @@ from dpcli.draw.palette import part_colors
 from dpcli.runtime.whole_file import make_folder, write_whole
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, PartJoint
 from dpcli.segment.kinematics.part_surfaces import part_surface
+from dpcli.standard_streams import printable
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE, TYPES
 
 _URDF_TYPES = {REVOLUTE: "revolute", PRISMATIC: "prismatic", FIXED: "fixed", FREE: "floating"}
@@ -26,7 +27,7 @@ def write_urdf(path: Path, tree: KinematicTree, name: str) -> None:
     """
     folder = path.with_name(f"{path.stem}_meshes")
     make_folder(folder)
-    robot = ElementTree.Element("robot", name=name)
+    robot = ElementTree.Element("robot", name=printable(name))  # XML has no place for control characters
     origins = link_origins(tree)
     for row, part in enumerate(tree.trajectories.ids.tolist()):
         file = folder / f"part_{part}.obj"

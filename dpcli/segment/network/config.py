@@ -33,7 +33,7 @@ class NetworkSettings:
         "point", "Who chooses the rotations of eq. 4.2: each point, or the whole cloud at once (global, an ablation)."
     )
     motion_head: bool = setting(True, "Have a motion head, which says each part's rotation between two frames.")
-    slots: int = setting(8, "Most parts that a frame can be divided into.", least=2)
+    slots: int = setting(8, "Most parts that a frame can be divided into.", least=2, most=1000)
     points: int = setting(512, "Points of each frame that the network sees.", least=32)
 
     def __post_init__(self) -> None:

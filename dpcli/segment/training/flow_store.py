@@ -114,7 +114,8 @@ def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.nd
         with path.open("r+b") as file:
             reserve(file.fileno(), path.stat().st_size)
     except OSError as error:
-        raise disk_full(path, error) or error from None
+        size = path.stat().st_size if path.exists() else 0
+        raise disk_full(path, error, needed=size) or error from None
     return array
 
 

@@ -37,7 +37,7 @@ class AtomicFile:
     """
 
     def __init__(self, target: str | Path, mode: str = "w", suffix: str = ".part") -> None:
-        self.target = Path(target)
+        self.target, self.needed = Path(target), 0
         self.part = self.target.with_name(f".{self.target.name}{suffix}")
         if not self.target.parent.is_dir():
             raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
@@ -73,14 +73,14 @@ class AtomicFile:
     def problem(self, error: BaseException | None, kept: str = "") -> DpcError | None:
         """Returns a DpcError for a write that found no room, None when `error` is something else.
 
-        kept: what stays for a run that continues, in words.
+        kept: what stays for a run that continues, in words. It writes that once more and the rest, `needed` bytes.
         """
         advice = (
             f"{kept}. Make room for that once more and for the rest, then run the same command again to continue"
             if kept
             else "nothing was left under that name. Free space, then run again"
         )
-        return disk_full(self.target, error, advice)
+        return disk_full(self.target, error, advice, needed=self.needed)
 
     def flush(self) -> None:
         """Hands everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""

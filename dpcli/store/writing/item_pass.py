@@ -62,6 +62,7 @@ class ItemPass:
     ) -> None:
         self.writer, self.names, self.words, self.skips = writer, names, words, skips
         self.places = (shard or WHOLE).places(len(names))
+        writer.expected = len(self.places)
         done = set(writer.written_names)
         if done:
             log.info(f"continuing: {len(done)} of {len(self.places)} {words.unit}s were {words.done} before")

@@ -36,7 +36,8 @@ class ResumableWriter(ABC):
     it, and `force` is off.
 
     Set before the block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see
-    write_positions), both kept in the file; a shard may be empty.
+    write_positions), both kept in the file; a shard may be empty. `expected`, how many samples will come, lets a full disk
+    be told with how much room they need.
 
     A subclass has its own state ready before it calls this constructor, which opens the file and has `_create` and, to
     continue, `write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
@@ -64,7 +65,7 @@ class ResumableWriter(ABC):
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
         self._journal: Journal | None = None
-        self._recorded = 0
+        self._recorded, self.expected = 0, 0
         self._open(force)
 
     def _about(self) -> dict[str, Any]:
@@ -171,6 +172,7 @@ class ResumableWriter(ABC):
         stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep or disk_full(self.path, error)
         kept = self._kept() if stopped else ""
         if hasattr(self, "_atomic"):
+            self._atomic.needed = self._needed()
             try:
                 self._atomic.failed(kind, error, trace, kept)
             finally:
@@ -180,6 +182,11 @@ class ResumableWriter(ABC):
         """Returns what a run that continues finds, in words; "" where that is nothing."""
         # not `len`, which counts the sample that found no room, too
         return f"the {self._recorded} samples done are kept" if self._journal and self._recorded else ""
+
+    def _needed(self) -> int:
+        """Returns about how many bytes all samples take, journal and all, by what those done take; 0 where nobody knows."""
+        files = [self._atomic.part, self._journal.path] if self._journal and self._recorded else []
+        return sum(one.stat().st_size for one in files if one.exists()) * self.expected // max(self._recorded, 1)
 
     def _leave_journal(self, kept: bool) -> None:
         if self._journal and kept:
@@ -198,6 +205,7 @@ class ResumableWriter(ABC):
         except BaseException as error:
             self._leave(type(error), error, None)
             raise
+        self._atomic.needed = self._needed()
         try:
             self._atomic.commit(self._kept())
         except (

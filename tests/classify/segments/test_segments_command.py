@@ -76,7 +76,7 @@ def test_time_that_runs_backwards_is_told_and_left_out(model, tmp_path, capsys):
     time[20:] -= 1.5
     assert run(recordings(tmp_path / "c.h5", time), "--model", model, "-o", "-") == 0
     said = capsys.readouterr()
-    assert "long: time runs back 1 times, first at frame 20" in said.err
+    assert "long: time runs back 1 time, first at frame 20" in said.err
     assert all(not row["start_seconds"] for row in rows(said.out)["long"])
 
 

@@ -21,7 +21,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import _IrregularFrames
+from dpcli.classify.commands.stream import Speaker, _IrregularFrames
+from dpcli.classify.confidence import Confidence
 from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
@@ -551,6 +552,17 @@ def test_nothing_happens_below_the_threshold_and_scores_stay(model_file, tmp_pat
     assert lines["0"][-1]["scores"] == lines["1"][-1]["scores"]
     with pytest.raises(UsageError, match="no threshold of its own"):
         predict(str(tmp_path / "s.npy"), str(model_file), stream=True, reject_below="auto")
+
+
+def test_lines_tell_the_confidence_that_the_threshold_is_held_against(capsys):
+    """Plain probabilities would contradict the verdict: here the larger of two is rejected and the smaller one is not."""
+    lines = Lines(Speaker(["wave", "bow", "sit"], ["static"], Confidence(0.5, 0.6), 4, 1), False)
+    for row in ([0.5, 0.48, 0.02], [0.48, 0.26, 0.26]):
+        scores = np.array([row, row], np.float32)
+        lines.write(Prediction(7, 1, scores, scores), 0.05, 0)
+    rejected, named = capsys.readouterr().out.splitlines()
+    assert rejected == "frame 7: nothing happening; best wave 0.52 (static wave 0.52); 50 ms"
+    assert named == "frame 7: wave 0.63 (static wave 0.63); 50 ms"
 
 
 def test_a_silence_is_told_once_and_counted(capsys):

@@ -12,6 +12,7 @@ from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import network_config, training_settings
 from dpcli.classify.training.fine_tune import _schedule, freeze, part_for, settings_from, train_mode
+from dpcli.classify.training.first_weights import take_weights
 from dpcli.classify.training.optimizer_step import StageStep
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
@@ -52,7 +53,7 @@ def model(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "all")])
+@pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "head"), (21, "all")])
 def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
     with CloudsReader(clouds(tmp_path / "c.h5", videos)) as reader:
         assert part_for(reader) == part
@@ -69,7 +70,25 @@ def test_where_everything_learns_it_is_at_the_rate_of_a_training_from_nothing(vi
     schedule = _schedule(quick, "all", videos)
     assert schedule.stage_epochs == epochs and schedule.learning_rate == quick.learning_rate
     assert _schedule(quick, "head", videos).stage_epochs == (max(5, min(100, 5000 // videos)),) * 2
-    assert _schedule(PRESETS["sparse"]["schedule"], "all", videos).epochs_dynamic == 0
+    assert _schedule(quick, "head", videos).learning_rate == _schedule(quick, "probe", videos).learning_rate == 6e-3
+    sparse = PRESETS["sparse"]["schedule"]
+    assert _schedule(sparse, "all", videos).epochs_dynamic == 0
+    assert _schedule(sparse, "head", videos).learning_rate == sparse.learning_rate
+
+
+@pytest.mark.parametrize("points, told", [(1, 0), (3, 0), (80, 1)])
+def test_frames_of_few_points_and_none_say_nothing_about_a_unit(points, told, tmp_path, capsys):
+    """The deviation of a frame without points is not a number, which is no other unit; that of one point is 0."""
+    path, rng = tmp_path / "c.h5", np.random.default_rng(0)
+    with CloudsWriter(path, class_names=["a", "b"]) as writer:
+        for k in range(4):
+            frames = [rng.normal(0, 9, (count, 3)).astype(np.float32) for count in (0, points, points)]
+            writer.write(CloudSequence.from_frames(f"v{k}", frames, label=k % 2, split="train"))
+    info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"])
+    with CloudsReader(path) as reader:
+        settings_from(info, reader, None)
+    said = capsys.readouterr().err
+    assert said.count("y deviates by ") == told and "nan" not in said
 
 
 def test_bodies_in_another_unit_are_made_as_tall_as_the_model_knows_them(tmp_path, capsys):
@@ -95,6 +114,8 @@ def test_only_what_learns_changes_and_batch_norms_of_the_rest_stay(part, stage, 
     step(torch.randn(4, 2, 32, 3) * 0.2, torch.tensor([0, 1, 2, 0]), 0.01)
     changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
     stream = "static" if stage == 0 else "dynamic"
+    slowest = min(group["share"] for group in step.optimizer.param_groups)
+    assert slowest == (0.1 if part == "all" else 1.0)  # a head alone has few steps, and its last layer is new
     start = {"probe": f"{stream}.head.classify", "head": f"{stream}.head", "all": stream}[part]
     assert changed and all(name.startswith(start) for name in changed)
     assert f"{stream}.head.classify.weight" in changed
@@ -114,6 +135,38 @@ def test_other_classes_go_on_from_a_model_with_its_own_network(videos, model, tm
     theirs, ours = load_model(model)[0].state_dict(), made.state_dict()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours if ".head" not in name)
     assert done.videos == (0 if videos == 1 else 2)
+
+
+def rows(network):
+    """The tensors of a network's classifiers, each by class: (copies, classes, ...)."""
+    state, count = network.state_dict(), network.config.num_classes
+    return {key: value.unflatten(0, (-1, count)) for key, value in state.items() if "classify" in key.split(".")}
+
+
+@pytest.mark.parametrize("preset, names", [("tiny", "bow,a,wave"), ("sparse", "c,wave,bow"), ("tiny", "x,y,z,b")])
+def test_rows_of_the_last_layers_go_by_the_names_of_the_classes(preset, names, capsys):
+    """As many classes as the model knows are no reason to begin with its rows: other classes in their places would have to be
+    unlearned. A sparse network has a row for each class and kind of copy, and forests, which are no weights."""
+    sizes = {name: value for name, value in SMALL.items() if name != "timing"} if preset == "tiny" else {}
+    theirs = ["a", "b", "c"]
+    model = Kinet(network_config(Given(preset, sets=sizes), 3).changed(forest=(5, 7) if preset == "sparse" else (0, 0)))
+    own_names = names.split(",")
+    mine = Kinet(network_config(Given(preset, sets=sizes), len(own_names)))
+    before = {key: value.clone() for key, value in rows(mine).items()}
+    take_weights(mine, model, own_names, theirs, "--init m")
+    known = rows(model)
+    for key, value in rows(mine).items():
+        for k, name in enumerate(own_names):
+            expected = known[key][:, theirs.index(name)] if name in theirs else before[key][:, k]
+            assert torch.equal(value[:, k], expected), (key, name)
+    others = {key: value for key, value in mine.state_dict().items() if key not in before and ".forest." not in key}
+    assert all(torch.equal(value, model.state_dict()[key]) for key, value in others.items())
+    shared = "".join(set(theirs) & set(own_names))
+    told = (
+        f"--init m: weights taken; it knows 1 of {len(own_names)} classes by name ({shared}), so the last layers learn"
+    )
+    forests = "; forests are grown anew at the end" if preset == "sparse" else ""
+    assert capsys.readouterr().err.strip().endswith(f"{told} the others from nothing{forests}")
 
 
 def test_what_can_not_be_tuned_is_refused(tmp_path, model):

@@ -276,7 +276,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
         == 0
     )
     told = capfd.readouterr().err
-    assert "tensors taken" in told and "static_temporal_radius" not in told
+    assert "weights taken" in told and "from nothing" not in told and "static_temporal_radius" not in told
     ours, theirs = load_model(str(tmp_path / "six")), load_model(str(alone))
     config = ours[1].config
     assert (config.num_frames, config.centroids, config.neighbors) == (6, (48, 24), 9)
@@ -346,7 +346,7 @@ def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, cap
         )
         == 0
     )
-    assert "fresh: head.classify" in capfd.readouterr().err
+    assert "it knows none of the 2 classes, so the last layers learn them from nothing" in capfd.readouterr().err
     started = load_model(str(tmp_path / "r"))[0]
     assert torch.equal(started.static.stage1.linear1.weight, model.static.stage1.linear1.weight)
     assert dpc("classify", "train", data, "-o", tmp_path / "x", "--set", "pretrain=true", "--frames", 8) == 2

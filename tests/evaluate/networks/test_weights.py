@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import weights as evaluate_weights
+from dpcli.cli.evaluate.app import WEIGHTS
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.commands import weights as commands
 from dpcli.evaluate.networks import weights as module
@@ -89,8 +89,10 @@ def test_the_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # the standard says to ignore it
     monkeypatch.setenv("HOME", str(tmp_path))
     assert weights_folder() == tmp_path / ".cache" / "dpc" / "weights"
-    with pytest.raises(UsageError, match="--weights .*nowhere: no such folder"):
-        weights_folder(tmp_path / "nowhere")
+    (tmp_path / "w.pt").touch()
+    for name, said in (("nowhere", "no such folder"), ("w.pt", "a file, expected a folder")):
+        with pytest.raises(DataError, match=f"--weights .*{name}: {said}"):
+            weights_folder(tmp_path / name)
 
 
 def test_a_missing_file_is_one_line(tmp_path):
@@ -353,7 +355,7 @@ def run(monkeypatch, server):
     for one in (module, commands):
         monkeypatch.setattr(one, "known_weights", lambda: {"toy": server.entry, "lost": lost})
     app = typer.Typer()
-    app.add_typer(evaluate_weights.app, name="weights")
+    app.add_typer(WEIGHTS.application(), name="weights")
     app.command("other")(lambda: None)
     return lambda *words: CliRunner().invoke(app, ["weights", *map(str, words)], catch_exceptions=False)
 

@@ -77,7 +77,7 @@ def test_it_goes_on_from_weights_of_the_same_sizes_only(trained, tmp_path, capsy
     [
         (("--set", "size=30"), 2, "size = 30: expected a multiple of 4"),
         (("nosuch.glb",), 3, "nosuch.glb: no such file or folder"),
-        (("--held-out", "nosuch.txt"), 2, "nosuch.txt: no such file"),
+        (("--held-out", "nosuch.txt"), 3, "nosuch.txt: no such file"),
     ],
 )
 def test_mistakes_are_said(words, code, said, tmp_path, capsys):

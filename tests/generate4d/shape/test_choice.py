@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError
 from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.optimizer import SceneOptimizer
 from dpcli.generate4d.shape.choice import guide
@@ -55,7 +55,7 @@ def test_without_weights_auto_inflates_and_says_so(targets, tmp_path, monkeypatc
         monkeypatch.setattr(f"dpcli.generate4d.shape.{where}.SHIPPED", tmp_path)
     assert guide("auto", targets).name == "inflated"
     assert "shape: inflated silhouette; this installation has no shape network" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="--prior-model creatures: no such file"):
+    with pytest.raises(DataError, match="--prior-model creatures: no such file"):
         guide("network", targets)
 
 

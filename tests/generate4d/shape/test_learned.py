@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.layers import Camera, points_of
 from dpcli.generate4d.shape.learned import Network, lengthened
@@ -98,7 +98,7 @@ def test_empty_frames_have_no_presence(weights):
 
 
 def test_wrong_files_are_said(weights, tmp_path):
-    with pytest.raises(UsageError, match="--prior-model nosuch: no such file"):
+    with pytest.raises(DataError, match="--prior-model nosuch: no such file"):
         Network("nosuch")
     (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-100])
     with pytest.raises(DataError, match="not a complete safetensors file"):

@@ -9,7 +9,9 @@ from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.actions.depth_units import require_plausible, without_marks
 from dpcli.prepare.decode.calibration import Calibration
+from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.scans.clouds import CloudFolders
 
 RNG = np.random.default_rng(0)
 
@@ -134,3 +136,25 @@ def test_the_units_of_a_calibration_are_used_unless_others_are_given(tmp_path):
         sample_of(tmp_path / "v.npy", floats, calibration=Calibration(camera, depth_scale=1.0)).sequence.points[0, 2]
         == 1.5
     )
+
+
+@pytest.mark.parametrize(("mark", "largest", "told"), [(2047, 1100, True), (4095, 3000, True), (2047, 2046, False)])
+def test_the_largest_number_of_a_sensors_bits_is_told_where_it_seems_a_mark(tmp_path, mark, largest, told):
+    frame = np.linspace(500, largest, 48 * 64).reshape(48, 64).astype("u2")
+    frame[5:15] = mark
+    notes = sample_of(tmp_path / "a.npy", np.stack([frame, frame]), fov=57).notes
+    assert any(f"many pixels hold {mark}" in note for note in notes) == told
+
+
+def test_folders_that_links_name_are_entered_but_those_above_are_not(tmp_path):
+    for place in ("store/v", "raw/b"):
+        (tmp_path / place).mkdir(parents=True)
+        for k in range(2):
+            np.save(tmp_path / place / f"{k}.npy", np.full((4, 5), 1000, "u2"))
+    (tmp_path / "raw" / "a").symlink_to(tmp_path / "store")
+    (tmp_path / "raw" / "up").symlink_to("..")
+    (tmp_path / "store" / "again").symlink_to(tmp_path / "raw")
+    assert [item.name for item in DepthVideos(inputs=(tmp_path / "raw",)).items()] == ["a/v", "b"]
+    assert [item.name for item in CloudFolders(tmp_path / "raw").items()] == ["a/v", "b"]
+    reasons = dict(unreadable_entries(tmp_path / "raw", []))
+    assert set(reasons) == {tmp_path / "raw" / "up", tmp_path / "raw" / "a" / "again"}

@@ -157,7 +157,13 @@ def test_mimic_joints_follow(tmp_path):
         ),
         ([link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")], "joint 'j' has the axis"),
         ([link("a"), '<joint name="j" type="revolute"><child link="a"/></joint>'], "not a valid URDF"),
-        ([link("a", '<box size="1 x 1"/>')], "not a valid URDF"),
+        (
+            [link("a", '<box size="1 x 1"/>')],
+            "link 'a': size='1 x 1' of <box>; expected 3 numbers, with spaces between",
+        ),
+        ([joint("j", "a", "b", axis="0, 0, 1")], "joint 'j': xyz='0, 0, 1' of <axis>; expected 3 numbers"),
+        ([joint("j", "a", "b", more='<mimic joint="k" offset="1e"/>')], "offset='1e' of <mimic>; expected 1 number,"),
+        ([link("a", '<mesh filename="m.stl" scale="1 1"/>')], "scale='1 1' of <mesh>; expected 1 or 3 numbers"),
         (['<link name="a"><visual/></link>'], "link 'a' has a <visual> without geometry; expected box"),
         (['<link name="a"><visual><geometry/></visual></link>'], "link 'a' has a <visual> without geometry"),
         ([link("a", '<box size="1 1 1"/><sphere radius="1"/>')], "link 'a' has 2 shapes in one <visual>"),
@@ -191,9 +197,11 @@ def test_meshes_that_cannot_be_used(tmp_path):
         load(with_mesh("gone.obj"))
     with pytest.raises(DataError, match="its mesh a.xyz is of an unknown format; expected one of .obj"):
         load(with_mesh("a.xyz", "1 2 3"))
-    with pytest.raises(DataError, match="its mesh bad.glb cannot be read"):
+    with pytest.raises(DataError, match="its mesh .*bad.glb: not a glTF file"):
         load(with_mesh("bad.glb", "nonsense"))
-    assert load(with_mesh("bad.stl", "nonsense")).notes["mesh files without faces"] == 1
+    with pytest.raises(DataError, match="its mesh .*bad.stl: truncated: its header alone has 84 bytes, it holds 8"):
+        load(with_mesh("bad.stl", "nonsense"))
+    assert load(with_mesh("empty.stl", "solid a\nendsolid a\n")).notes["mesh files without faces"] == 1
     flat = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
     obj = load(with_mesh("flat.obj", flat))
     assert obj.notes["triangles without area dropped"] == 1 and obj.body_areas[0] == 0
@@ -392,6 +400,36 @@ def test_urdfs_as_other_programs_write_them(before, robot, tmp_path):
     assert not item.problem and len(load(item.path).joints) == 1
 
 
+ODD = {
+    "link": '<inertial><mass value="1.0 kg"/><inertia ixx="a"/></inertial><contact><lateral_friction value=""/></contact>'
+    '<collision><geometry><box size="x"/></geometry></collision>',
+    "visual": '<material name="$(arg color)"><color rgba="red"/></material>',
+    "joint": '<dynamics damping="" friction="a"/><safety_controller soft_lower_limit="x"/><calibration rising="x"/>',
+    "limit": 'effort="unlimited" ',
+    "robot": '<transmission><joint/></transmission><gazebo><plugin filename="$(find x)"/></gazebo><sensor type="q"/>'
+    '<material name="q"><color rgba="1,0,0,1"/></material>',
+}
+
+
+@pytest.mark.parametrize("place", ODD)
+def test_what_is_not_read_of_a_urdf_may_be_as_odd_as_it_likes(place, tmp_path):
+    path = two(tmp_path)
+    plain = load(path)
+    text = path.read_text()
+    text = text.replace("<limit ", "<limit " + ODD[place]) if place == "limit" else text
+    path.write_text(text.replace(f"</{place}>", ODD[place] + f"</{place}>"))
+    assert ODD[place] in path.read_text()
+    np.testing.assert_array_equal(load(path).triangles, plain.triangles)
+    assert load(path).joints[0].upper == plain.joints[0].upper and load(path).notes == plain.notes
+
+
+def test_empty_texts_are_none(tmp_path):
+    path = two(tmp_path)
+    plain = load(path)
+    path.write_text(path.read_text().replace("<geometry>", '<origin xyz="" rpy=" "/><geometry>', 1))
+    np.testing.assert_array_equal(load(path).triangles, plain.triangles)
+
+
 def test_capsules_are_drawn_and_odd_collisions_passed_over(tmp_path):
     odd = link("b", "<cone radius='1'/>", kind="collision").replace("</link>", "").replace('<link name="b">', "")
     capsule = link("b", '<capsule radius="0.5" length="2"/>', xyz="0 0 1").replace("</link>", odd + "</link>")
@@ -515,8 +553,9 @@ def test_nothing_outside_the_folder_is_opened(name, tmp_path):
 def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
     (tmp_path / "robot" / "meshes").mkdir(parents=True)
     (tmp_path / "robot" / "meshes" / "c.obj").write_text(CUBE_OBJ)
-    shapes = [f'<mesh filename="{name}"/>' for name in ("../meshes/c.obj", "package://robot/meshes/c.obj")]
-    elements = [link("a", shapes[0]), link("b", shapes[1]), joint("j", "a", "b")]
+    names = ("../meshes/c.obj", "package://robot/meshes/c.obj", "package:///meshes/c.obj")
+    shapes = [link(f"b{k}", f'<mesh filename="{name}"/>') for k, name in enumerate(names)]
+    elements = [link("a"), *shapes, *(joint(f"j{k}", "a", f"b{k}") for k in range(3))]
     (tmp_path / "robot" / "urdf").mkdir()
     write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
     assert not Sapien(tmp_path).items()[0].problem
@@ -541,7 +580,7 @@ def test_meshes_open_no_files_outside_either(tmp_path):
     (tmp_path / "raw" / "m.gltf").write_text(json.dumps(tree))
     elements = [link("a", '<mesh filename="m.gltf"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
     path = write_urdf(tmp_path / "raw" / "r.urdf", *elements)
-    with pytest.raises(DataError, match="m.gltf cannot be read .*secret.bin' lies outside"):
+    with pytest.raises(DataError, match="m.gltf: refers to '../secret.bin' outside its folder"):
         load_object(read_skeleton(path, tmp_path / "raw"))
     assert load_object(read_skeleton(path, None)).notes["triangles without area dropped"] == 1
 

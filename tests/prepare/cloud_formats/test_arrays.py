@@ -147,6 +147,14 @@ def test_a_bin_of_another_type_is_refused(tmp_path):
         read_bin(tmp_path / "0.bin", 4)
 
 
+def test_a_bin_that_holds_axis_after_axis_is_refused_unless_its_columns_are_said(tmp_path):
+    scan(4, 500, 0).astype("<f4").T.tofile(tmp_path / "0.bin")
+    with pytest.raises(DataError, match=r"axis after axis, all x first; .*reshape\(4, -1\).T"):
+        guess_bin_columns([tmp_path / "0.bin"])
+    item = CloudFolders(tmp_path, bin_columns=4).items()[0]
+    assert CloudFolders(tmp_path, bin_columns=4).read(item, np.random.default_rng(0)).sequence.num_frames == 1
+
+
 def test_a_count_before_the_points_is_no_coordinate(tmp_path):
     (tmp_path / "0.bin").write_bytes(np.uint32(500).tobytes() + scan(4, 500, 0).tobytes())
     with pytest.raises(DataError, match="no coordinate, but the whole number 500; a header before the points"):

@@ -15,7 +15,7 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, read_text
 from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
@@ -71,6 +71,8 @@ def test_what_csv_writers_write_is_read_back(tmp_path, data):
         "0,1,2\n0.126,-0.132,0.64\n0.105,-0.536,0.362\n-1.265,-0.623,0.041\n",
         ",0,1,2,3\n0,0.126,-0.132,0.64,9\n1,0.105,-0.536,0.362,9\n2,-1.265,-0.623,0.041,8\n",
         "1 0.126 -0.132 0.64\n2 0.105 -0.536 0.362\n3 -1.265 -0.623 0.041\n",
+        '"x" "y" "z"\n"1" 0.126 -0.132 0.64\n"2" 0.105 -0.536 0.362\n"3" -1.265 -0.623 0.041\n',
+        "x,y,z\n0.126,\u22120.132,0.64\n0.105,\u22120.536,0.362\n\u22121.265,\u22120.623,0.041\n",
         "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
     ],
 )
@@ -92,6 +94,9 @@ def test_texts_of_the_same_points(tmp_path, text):
         ('x,y,z\n"1,500","-2,250",500\n', [1500, -2250, 500]),
         ("x;y;z\n1,500;2,250;1,125\n", [1.5, 2.25, 1.125]),
         ("x;y;z\n1,500;0,250;7\n", [1.5, 0.25, 7]),
+        ("x;y;z\n448.262.123;-5.411.932;1.000\n", [448262123, -5411932, 1000]),
+        ("x;y;z\n1.500;-2.250;7\n", [1.5, -2.25, 7]),
+        ("x,y,z\n1.500,2,3\n" + "\0" * 600, [1.5, 2, 3]),
     ],
 )
 def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
@@ -103,14 +108,19 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
     [
         ("x,y,z\n0,126,-0,132,0,640\n", "a.csv:2: 6 values; .*decimal commas between commas"),
         ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
+        ("1,5, 2,25, 3,5\n4,5, 5,25, 6,5\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
+        ("x;y;z\n1.500;2;3\n500;2;3\n", "1.500 beside 500 may be 1500 or 1.500"),
         ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
         ("\n\n", "no rows"),
         ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
         ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
         ("x_mm,y_mm,z_m\n1,2,3\n", "different units"),
+        ("# frame 0\n1 2 3\n# frame 1\n4 5 6\n", "comments such as '# frame 1' divide its rows into frames"),
+        ("x y z\n1 2 3\n// Scan no: 2\n4 5 6\n", "comments such as '// Scan no: 2' divide its rows into frames"),
+        ("x [ms],y [ms],z [ms]\n1,2,3\n", "expected x, y and z among them"),
         ("frame,x,y,z\n0,1,2,3\n1,1,2,3\n", "'frame' numbers 2 frames; --frame-column frame"),
     ],
 )
@@ -185,6 +195,27 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
         read_cloud(tmp_path / "a.ptx")
 
 
+def test_a_ptx_written_by_its_description_gives_the_places_in_the_world(tmp_path):
+    """The description: a point lies at the scanner's place plus x, y and z along the scanner's axes, which the header lists
+    before the matrix that repeats them.
+    """
+    rng = np.random.default_rng(1)
+    place, world = np.array([448_262.5, 5_411_932.25, 103.125]), rng.uniform(-20, 20, (5, 3))
+    axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))  # a row each
+    own = [" ".join(f"{float(np.dot(point, axis)):.9f}" for axis in axes) for point in world]
+    rows = [[f"{value:.12f}" for value in axis] for axis in axes]
+    where = [f"{value:.6f}" for value in place]
+    head = ["5", "1", " ".join(where), *map(" ".join, rows)]
+    matrix = [" ".join([*row, "0.000000"]) for row in rows] + [" ".join([*where, "1.000000"])]
+    lines = [*head, *matrix, *(f"{point} 0.250000 10 20 30" for point in own)]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.ptx").points, world + place, atol=1e-6)
+    lines[len(head) : len(head) + 4] = [" ".join(row) for row in zip(*(line.split() for line in matrix))]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match="the matrix in rows 7 to 10 doesn't end with 0 0 0 1 in its last column"):
+        read_cloud(tmp_path / "a.ptx")
+
+
 def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_path):
     scan = "".join(f"{k} 7 1.5 2.25 0.{k}5 128\n" for k in range(3, 6))
     with pytest.raises(DataError, match="its first 2 columns hold whole numbers, .*which are x, y and z"):
@@ -210,6 +241,12 @@ def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
     with pytest.raises(DataError, match="--keep-fields t: float32, .* would round its values by up to 0.1;"):
         read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,1700000000.0\n1,2,4,1700000000.1\n", keep=["t"])
     assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
+
+
+def test_comments_and_empty_lines_between_rows(tmp_path):
+    assert len(read(tmp_path / "a.xyz", "1 2 3\n# 5 outliers left out\n4 5 6\n# frame 7\n").points) == 2
+    assert read(tmp_path / "a.xyz", "1 2 3\n\n4 5 6\n\n\n").dropped == {}
+    assert read(tmp_path / "a.xyz", "1 2 3\n\n\n4 5 6\n").dropped == {BLOCKS: 1}
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):
@@ -238,6 +275,11 @@ def test_bytes_that_are_no_text(tmp_path):
         ("Points_m_XYZ:0 Points_m_XYZ:1 Points_m_XYZ:2 intensity", [0, 1, 2], ""),
         ("X1 (mm)|Y1 (mm)|Z1 (mm)|X2 (mm)|Y2 (mm)|Z2 (mm)", [0, 1, 2], "mm"),
         ("x (in)|y (in)|z (in)", [0, 1, 2], "in"),
+        ("x [µm]|y [µm]|z [µm]", [0, 1, 2], "um"),
+        ("x_um y_um z_um", [0, 1, 2], "um"),
+        ("x [dm]|y [dm]|z [dm]", [0, 1, 2], "dm"),
+        ("x in mm|y in mm|z in mm", [0, 1, 2], "mm"),
+        ("X-Koord. [m]|Y-Koord. [m]|Z-Koord. [m]|Höhe [cm]", [0, 1, 2], "m"),
     ],
 )
 def test_styles_of_headers(names, places, unit):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dpcli.prepare.decode.depth_files import read_frame
+from dpcli.errors import DataError
+from dpcli.prepare.decode.depth_files import WHITE_AT_ZERO, read_array, read_depth_video, read_frame
 
 quick = settings(
     max_examples=120, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -89,3 +92,68 @@ def test_arrays_of_numpy(tmp_path, kind, order):
     frame = np.random.default_rng(0).uniform(0, 200, (37, 23)).astype(kind)
     np.save(tmp_path / "a.npy", np.asarray(frame, order=order))
     np.testing.assert_array_equal(read_frame(tmp_path / "a.npy"), frame)
+
+
+@pytest.mark.parametrize(("most", "kind"), [(100, "u1"), (255, "u1"), (4095, "u2")])
+def test_texts_of_gray_levels_are_what_they_say(tmp_path, most, kind):
+    path = tmp_path / "a.pgm"
+    path.write_text(f"P2 # of depth\n3 2\n{most}\n0 1 2 # a row\n50 99 {most}\n")
+    found = read_frame(path)
+    assert found.tolist() == [[0, 1, 2], [50, 99, most]] and found.dtype == kind
+    path.write_text(f"P2\n3 2\n{most}\n0 1 2\n50 99\n")
+    with pytest.raises(DataError, match="5 levels of 3x2 pixels, .* truncated or damaged"):
+        read_frame(path)
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+def test_white_at_zero_is_told_and_changes_no_number(tmp_path, kind):
+    frame = np.arange(10, 30).reshape(4, 5).astype(kind)
+    bits, form = 8 * frame.itemsize, 3 if kind == "f4" else 1
+    tags = [(256, 5), (257, 4), (258, bits), (259, 1), (262, 0), (273, 8), (277, 1), (278, 4), (279, frame.nbytes)]
+    tags = sorted([*tags, (339, form)])
+    entries = b"".join(struct.pack("<HHII", tag, 4 if tag in (273, 279) else 3, 1, value) for tag, value in tags)
+    data = frame.tobytes() + struct.pack("<H", len(tags)) + entries + bytes(4)
+    (tmp_path / "0.tif").write_bytes(b"II*\0" + struct.pack("<I", 8 + frame.nbytes) + data)
+    np.testing.assert_array_equal(read_frame(tmp_path / "0.tif"), frame)
+    assert read_depth_video(tmp_path).notes == {WHITE_AT_ZERO: 1}
+    Image.fromarray(frame).save(tmp_path / "0.tif")
+    assert read_depth_video(tmp_path).notes == {}
+
+
+def test_pictures_that_opencv_would_change_are_refused(tmp_path):
+    values = np.ones((2, 3), np.float32)
+    (tmp_path / "a.pfm").write_bytes(b"Pf\n3 2\n-2.0\n" + values.tobytes())
+    with pytest.raises(DataError, match="its header gives the scale -2.0"):
+        read_frame(tmp_path / "a.pfm")
+    for scale in (b"-1", b"-1.0", b"-1.000000"):
+        (tmp_path / "a.pfm").write_bytes(b"Pf\n3 2\n" + scale + b"\n" + values.tobytes())
+        np.testing.assert_array_equal(read_frame(tmp_path / "a.pfm"), values)
+    Image.fromarray(values > 0).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match="1 bits a pixel, too few for depth"):
+        read_frame(tmp_path / "a.png")
+    gray = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    Image.merge("LA", [Image.fromarray(gray), Image.new("L", (3, 2), 255)]).save(tmp_path / "b.png")
+    np.testing.assert_array_equal(read_frame(tmp_path / "b.png"), gray)
+    Image.merge("LA", [Image.fromarray(gray), Image.new("L", (3, 2), 9)]).save(tmp_path / "b.png")
+    with pytest.raises(DataError, match="a color image"):
+        read_frame(tmp_path / "b.png")
+
+
+@pytest.mark.parametrize("shape", [(48, 80, 6), (480, 640, 300), (424, 512, 100)])
+def test_an_array_whose_frames_come_last_is_refused(tmp_path, shape):
+    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint16, shape)  # a sparse file, which is not read
+    with pytest.raises(DataError, match=r"save numpy.moveaxis\(array, -1, 0\)"):
+        read_array(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("shape", [(6, 48, 80), (2, 640, 480), (40, 60, 16), (3, 37, 5)])
+def test_an_array_whose_frames_come_first_is_read(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.broadcast_to(np.uint16(1), shape))
+    assert read_array(tmp_path / "a.npy").shape == shape
+
+
+@pytest.mark.parametrize("name", ["0.png", "0.tif", "0.npy", "0.mp4"])
+def test_what_stands_in_for_a_file_is_told(tmp_path, name):
+    (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; fetch the file itself: git lfs pull"):
+        read_depth_video(tmp_path if name.endswith(("png", "tif")) else tmp_path / name)

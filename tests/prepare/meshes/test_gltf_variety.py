@@ -130,6 +130,27 @@ def test_a_mirrored_node_keeps_its_front(tmp_path):
     assert look(load(file, tmp_path))[32, 32, 3] == 0
 
 
+def test_of_several_scenes_the_one_that_viewers_show_is_read_and_told(tmp_path, capsys):
+    file = quad()
+    index = node(file, mesh=square(file, 5.0))
+    file.tree |= {"scenes": [{"nodes": [0]}, {"nodes": [index], "name": "take 2"}], "scene": 1}
+    assert load(file, tmp_path).positions[..., 0].min() == 4
+    assert "2 scenes in it; 1 (take 2) is read, as viewers do" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scales", [(1, -1), (-1, 0.5), (-0.5, 1)])
+def test_a_front_is_in_front_in_every_frame_of_a_clip_that_mirrors_it(scales, tmp_path):
+    """As flat figures turn round, by a scale that jumps below 0; a scene names its root twice, too."""
+    file = quad()
+    file.tree["scenes"][0]["nodes"] = [0, 0]
+    node(file, mesh=square(file, 0.0, z=-0.5))
+    del file.tree["animations"]
+    file.animate(0, "scale", [0, 1, 2], [[scale, 1, 1] for scale in (*scales, scales[1])], "STEP")
+    mesh = load(file, tmp_path, frames=2)
+    assert [look(mesh.frames(k, k + 1))[32, 32].tolist() for k in (0, 1)] == [[255] * 4] * 2
+    assert mesh.positions.shape[1] == 8
+
+
 def test_a_leaf_of_two_triangles_back_to_back_has_no_holes(tmp_path):
     file = quad()
     primitive = file.tree["meshes"][0]["primitives"][0]
@@ -617,8 +638,9 @@ def archive(*names: str) -> bytes:
         ("m.stl", bytes(80) + b"\1\0\0\0" + bytes(50), "STL; it holds one shape"),
         ("m.mp4", b"\0\0\0\x18ftypmp42", "a video; use `dpc prepare video`"),
         ("m.glb", b"<!DOCTYPE HTML><html>", "a web page; download it again"),
-        ("m.glb", b"version https://git-lfs.github.com/spec/v1", "Git LFS; fetch the file itself"),
+        ("m.glb", b"version https://git-lfs.github.com/spec/v1", "Git LFS; `git lfs pull` brings the file itself"),
         ("m.gltf", "{}".encode("utf-16"), "UTF-16; save it as UTF-8"),
+        ("m.glb", b"\0\0\0\x18ftypheic", "a HEIC picture; name a model"),
     ],
 )
 def test_files_of_other_formats_are_told_what_to_do(tmp_path, name, data, words):

@@ -247,8 +247,21 @@ def test_what_else_lies_there_is_named(tmp_path):
     reader = CloudFolders(tmp_path)
     assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .e57 file"
     (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
-    with pytest.raises(DataError, match="no point clouds .*found 1 .e57 file, 1 .gz file: save their points as .ply"):
+    with pytest.raises(DataError, match="found 1 .e57 file, 1 .gz file: save their points as .ply, .*, or unpack them"):
         CloudFolders(tmp_path).items()
+    (tmp_path / "a.xlsx").write_bytes(b"PK")
+    with pytest.raises(DataError, match="a.xlsx: .xlsx files are not read: save their sheets as .csv"):
+        CloudFolders(tmp_path / "a.xlsx").items()
+
+
+@pytest.mark.parametrize("name", ["0.ply", "0.pcd", "0.las", "0.npy", "0.bin", "0.csv", "0.npz"])
+def test_what_stands_in_for_a_file_is_told(tmp_path, name):
+    (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; fetch the file itself: git lfs pull"):
+        read_cloud(tmp_path / name)
+    (tmp_path / name).write_bytes(b"<!DOCTYPE html>\n<html><body>Sign in</body></html>")
+    with pytest.raises(DataError, match=f"{name}: a web page; download it again"):
+        read_cloud(tmp_path / name)
 
 
 def test_texts_of_a_vehicles_sensors_are_no_clouds(tmp_path):

@@ -633,6 +633,7 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
         ((0, 0.5, 2.5), None, (0, 0.5, 2.5), "0 to 2.5 are taken for seconds"),
         ((0, 0.5, 2.5), 10, (0, 0.04, 0.2), "0 to 2.5 are taken for shares of a clip of 10 frames per second"),
         ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames, 10 per second"),
+        ((1.7e9, 1.7e9 + 0.5, 1.7e9 + 2), None, (0, 0.5, 2), "1700000000 to 1700000002 are taken for seconds"),
     ],
 )
 def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys, times, fps, seconds, said):
@@ -669,6 +670,8 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
             "a focal length of 1.04 pixels for pictures of 64x48; expected pixels, not shares",
         ),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
+        (lambda d: d.update(cx=0.5, cy=0.52), "a principal point at 0.5, 0.52; expected pixels, not shares"),
+        (lambda d: d.update(distortion_params=[0.1, 0, 0, 0]), "distortion_params .0.1, 0, 0, 0.; expected pictures"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),
         (lambda d: d["frames"][1].update(time=0), "r_0_1.png and r_0_0.png are of one camera at one time, 0"),
         (lambda d: d["frames"][1].update(fl_x=90), "the camera moves or zooms"),
@@ -694,6 +697,17 @@ def test_bad_transforms(tmp_path, change, message):
     change(data)
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
+        transforms_clip(folder, SMALL)
+
+
+def test_inverted_poses_are_noticed(tmp_path):
+    """Cameras around the origin, as world to camera: all seem to stand in one place."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    data = json.loads((folder / "transforms_train.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = np.linalg.inv(frame["transform_matrix"]).tolist()
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    with pytest.raises(DataError, match="its 3 cameras stand in one place, turned differently; .* are they inverted"):
         transforms_clip(folder, SMALL)
 
 
@@ -788,3 +802,43 @@ def test_what_is_left_out_is_told_once(tmp_path, capfd, other, pattern):
     chosen = ("--pattern", pattern) if pattern else ()
     assert exit_code("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32", *chosen) == 0
     assert capfd.readouterr().err.count("left out") == 1
+
+
+@pytest.mark.parametrize("beside", ["sparse", "../transforms.json", "../cameras", "0.xmp", "edits.xmp", "../../sparse"])
+def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(tmp_path, capfd, beside):
+    folder = save(tmp_path / "scene" / "images", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (folder / beside).write_text('<x:xmpmeta xcr:Position="1"/>' if beside == "0.xmp" else "<x:xmpmeta/>")
+    open_frames(folder)
+    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is taken to stand still"
+    assert (said in capfd.readouterr().err) == (beside not in ("edits.xmp", "../../sparse"))
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "said"),
+    [
+        ("0.heic", b"\0\0\0\x18ftypheic", "0.heic: a HEIC picture, which is not read; convert it to PNG"),
+        ("0.exr", b"v/1\x01\2", "0.exr: an EXR picture, which is not read"),
+        ("0.dng", b"II*\0", "0.dng: a raw picture of a camera"),
+        ("frame", b"\x89PNG", "frame is an image without the suffix of one"),
+        (".frame", b"\x89PNG", r"ppm\)$"),
+    ],
+)
+def test_a_folder_without_frames_says_what_it_holds(tmp_path, name, start, said):
+    (tmp_path / name).write_bytes(start + bytes(20))
+    with pytest.raises(DataError, match=f"no frames; expected images .*{said}"):
+        open_frames(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["tga", "jp2", "ppm", "jfif"])
+def test_images_of_rarer_suffixes_are_frames(tmp_path, suffix):
+    folder = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    for path in list(folder.iterdir()):
+        image = Image.open(path)
+        (image if suffix in ("tga", "jp2") else image.convert("RGB")).save(
+            path.with_suffix(f".{suffix}"), "JPEG" if suffix == "jfif" else None, quality=95
+        )
+        path.unlink()
+    frames = open_frames(folder)
+    read, written = next(frames.read([0])), disc((20, 24), 8)
+    assert len(frames) == 3 and np.abs(read[24, 20].astype(int) - written[24, 20]).max() <= 6
+    assert (read[0, 0, 3] == 0) == (suffix in ("tga", "jp2"))

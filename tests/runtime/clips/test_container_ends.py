@@ -1,11 +1,16 @@
 """Truncated videos of every container: what is lost is told, and whole files pass."""
 
+import re
+import zlib
+
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.depth_files import read_depth_video
+from dpcli.runtime.clips.animations import animation_times
 from dpcli.runtime.clips.container_ends import ends_early
 from dpcli.runtime.clips.video_frames import look_at_video
 from dpcli.runtime.progress import log
@@ -81,3 +86,33 @@ def test_a_live_recording_promises_no_end(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert not ends_early(path)
+
+
+@pytest.mark.parametrize("begun", [0, 2])
+def test_what_lies_between_two_frames_ends_the_video_with_a_sentence(begun, tmp_path):
+    frame = bytes(24 * 32 * 3 // 2)
+    between = b"FRAME\n" + frame
+    (tmp_path / "a.y4m").write_bytes(b"YUV4MPEG2 W32 H24 F10:1 C420\n" + between * begun + b"NOISE\n" + frame + between)
+    with pytest.raises(DataError, match="only 2 frames can be decoded" if begun else "no frame can be decoded"):
+        look_at_video(tmp_path / "a.y4m")
+
+
+@pytest.mark.parametrize("kind", ["png", "webp"])
+def test_pictures_behind_those_that_an_animation_counts_are_told(kind, tmp_path, monkeypatch):
+    path, said = tmp_path / f"a.{kind}", []
+    monkeypatch.setattr(log, "warn", said.append)
+    pictures = [Image.fromarray(np.full((8, 8, 3), 40 * k, np.uint8)) for k in range(5)]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, lossless=True)
+    data = bytearray(path.read_bytes())
+    assert len(animation_times(path)) == 5 and not said
+    if kind == "png":
+        at = data.find(b"acTL")
+        data[at + 4 : at + 8] = (3).to_bytes(4, "big")
+        data[at + 12 : at + 16] = zlib.crc32(bytes(data[at : at + 12])).to_bytes(4, "big")
+    else:
+        at = [one.start() for one in re.finditer(b"ANMF", bytes(data))][3]
+        data[4:8] = (at - 8).to_bytes(4, "little")
+    path.write_bytes(data)
+    assert len(animation_times(path)) == 3 and said == [
+        f"{path}: 2 pictures lie behind the 3 that its header counts, and are left out"
+    ]

@@ -34,6 +34,10 @@ def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
     exif[0x0112] = orientation
     turned.save(tmp_path / "0.png", exif=exif)
     np.testing.assert_array_equal(read_rgba(tmp_path / "0.png")[..., :3], rgb)
+    for kind in ("png", "webp"):  # FFmpeg decodes the one, and turns it, Pillow the other
+        other = Image.new("RGB", turned.size)
+        turned.save(tmp_path / f"moving.{kind}", exif=exif, save_all=True, append_images=[other], lossless=True)
+        np.testing.assert_array_equal(next(open_frames(tmp_path / f"moving.{kind}").read([0]))[..., :3], rgb)
 
 
 def shown(rgb: np.ndarray, primaries, gamma: float) -> np.ndarray:
@@ -197,6 +201,9 @@ def test_pages_of_a_tiff_are_no_clip(tmp_path):
         (["13-02-2024 10.00.00.png", "14-01-2024 10.00.00.png"], ""),
         (["shot 12.00.00 PM.png", "shot 1.00.00 PM.png"], "clocks of 12 hours"),
         (["cam 1pma.png", "cam 2pma.png"], ""),
+        (["a 23-59-59.png", "a 00-00-01.png"], "whether these times of day go on past midnight"),
+        (["a 13-59-59.png", "a 14-00-01.png"], ""),
+        (["2024-02-13 23.59.59.png", "2024-02-14 00.00.01.png"], ""),
     ],
 )
 def test_names_that_may_mean_two_times_are_told(names, words, tmp_path, capfd):

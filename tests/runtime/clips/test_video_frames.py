@@ -102,6 +102,19 @@ def test_without_alpha_everything_is_opaque(pictures, tmp_path, name):
     assert not look_at_video(path).has_alpha and (decoded(path)[..., 3] == 255).all()
 
 
+@pytest.mark.parametrize("name", ["raw.avi", "animation.mov"])
+def test_an_alpha_of_0_everywhere_is_none(pictures, tmp_path, capfd, name):
+    """Windows leaves the fourth byte of its pixels empty, and so do programs that record them."""
+    words = {
+        "raw.avi": ("-c:v", "rawvideo", "-pix_fmt", "bgra"),
+        "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
+    }
+    path = film(pictures, tmp_path / name, "-vf", "format=rgba,lutrgb=a=0", *words[name])
+    read = decoded(path)
+    assert (read[..., 3] == 255).all() and read[0, 20, 12].tolist() == [200, 30, 30, 255]
+    assert not look_at_video(path).has_alpha and "its alpha is 0 everywhere" in capfd.readouterr().err
+
+
 PLAIN = ("-pix_fmt", "yuv420p", "-c:v", "libx264", "-crf", 10)
 SUFFIXES = {
     "av1.mp4": ("-pix_fmt", "yuv420p", "-c:v", "libsvtav1", "-crf", 20),
@@ -185,17 +198,18 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
-def with_clean_aperture(mp4: bytes, aperture: tuple[int, ...]) -> bytes:
-    """An MP4 whose index comes last, with a `clap` box at the end of the sample entry of its one video."""
+def with_box(mp4: bytes, box: bytes, depth: int = 7) -> bytes:
+    """An MP4 whose index comes last, with a box at the end of the sample entry of its one video, or `depth` boxes down."""
     data, (start, stop), above = bytearray(mp4), (0, len(mp4)), []
-    for name, skipped in zip((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"), (8, 8, 8, 8, 8, 16, 86)):
+    names = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1")
+    for name, skipped in zip(names[:depth], (8, 8, 8, 8, 8, 16, 86)):
         while data[start + 4 : start + 8] != name:
             start += int.from_bytes(data[start : start + 4], "big")
         above.append(start)
         start, stop = start + skipped, start + int.from_bytes(data[start : start + 4], "big")
-    data[stop:stop] = struct.pack(">I4s8i", 40, b"clap", *aperture)
+    data[stop:stop] = box
     for at in above:
-        data[at : at + 4] = struct.pack(">I", int.from_bytes(data[at : at + 4], "big") + 40)
+        data[at : at + 4] = struct.pack(">I", int.from_bytes(data[at : at + 4], "big") + len(box))
     return bytes(data)
 
 
@@ -203,7 +217,7 @@ def with_clean_aperture(mp4: bytes, aperture: tuple[int, ...]) -> bytes:
 def test_margins_that_a_container_cuts_off_are_not_shown(pictures, tmp_path, capfd, name):
     """40 x 30, whose middle lies 4 to the right of the frame's and 3 above: columns 16 to 56, rows 14 to 44."""
     whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
-    cut = with_clean_aperture(whole.read_bytes(), (40, 1, 30, 1, 4, 1, -6, 2))
+    cut = with_box(whole.read_bytes(), struct.pack(">I4s8i", 40, b"clap", 40, 1, 30, 1, 4, 1, -6, 2))
     (tmp_path / "c.mp4").write_bytes(cut)
     if name != "c.mp4":
         ffmpeg("-i", tmp_path / "c.mp4", "-c", "copy", tmp_path / name)
@@ -220,6 +234,31 @@ def test_margins_that_a_codec_cuts_off_are_not_shown(pictures, tmp_path, margins
         decoded(tmp_path / "cut.mp4")[..., 3, 3, :], decoded(whole)[:, top:, left : SIDE - right][..., 3, 3, :]
     )
     assert decoded(tmp_path / "cut.mp4").shape[1:3] == (SIDE - top, SIDE - left - right)
+
+
+def test_dolby_vision_of_its_own_colors_is_refused_and_of_others_colors_is_not(pictures, tmp_path):
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN).read_bytes()
+    for name, profile in ((b"dvcC", 5), (b"dvvC", 8)):
+        box = struct.pack(">I4s2B20s", 32, name, 1, 0, bytes([profile << 1, 3 << 3 | 5]))
+        (tmp_path / "c.mp4").write_bytes(with_box(whole, box + bytes(2)))
+        if profile == 5:
+            with pytest.raises(DataError, match="c.mp4: Dolby Vision of profile 5"):
+                look_at_video(tmp_path / "c.mp4")
+        else:
+            assert look_at_video(tmp_path / "c.mp4").count == COUNT
+
+
+def test_a_file_that_says_it_holds_two_views_or_a_panorama_is_told(pictures, tmp_path, capfd):
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
+    ffmpeg("-i", whole, "-c", "copy", "-metadata:s:v", "stereo_mode=left_right", tmp_path / "two.mkv")
+    words = {"Spherical": "true", "Stitched": "true", "StitchingSoftware": "x", "ProjectionType": "equirectangular"}
+    text = "".join(f"<GSpherical:{key}>{value}</GSpherical:{key}>" for key, value in words.items()).encode()
+    box = b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + text
+    (tmp_path / "round.mp4").write_bytes(with_box(whole.read_bytes(), struct.pack(">I", len(box) + 4) + box, depth=2))
+    for name, said in (("two.mkv", "two views side by side"), ("round.mp4", "a panorama"), ("whole.mp4", "")):
+        look_at_video(tmp_path / name)
+        error = capfd.readouterr().err
+        assert f"{name}: {said}, as the file says" in error if said else not error
 
 
 def test_of_a_turn_that_is_no_quarter_is_told(pictures, tmp_path, capfd):
@@ -320,11 +359,13 @@ def test_a_pattern_that_chooses_nothing_is_told(pictures, tmp_path):
 @pytest.mark.parametrize(
     "start, said",
     [
-        (b"PK\3\4", "an archive; unpack it first"),
+        (b"PK\3\4", "a zip archive; unpack it first"),
+        (b"Kaydara FBX Binary  \0", "FBX; for a clip of a model, export glTF 2.0"),
         (b"\0\0\0\x18ftypheic", "a HEIC picture, which is not read; convert it"),
         (b"\x93NUMPY\1\0", "an array of NumPy"),
+        (b"\0\0\0\x18stypmsdh", "a piece of a streamed video; put its beginning before it"),
         (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
-        (b"<!DOCTYPE html>", "a web page in place of a download"),
+        (b"<!DOCTYPE html>", "a web page; download it again"),
         (b'\xef\xbb\xbf{"annotations": []}', "JSON; where it holds annotations, draw their masks"),
         (b"", "(empty)"),
     ],
@@ -401,6 +442,36 @@ def test_every_label_but_0_is_opaque_and_what_may_mean_undecided_is_told(tmp_pat
     assert f"{said} is read as the object" in capfd.readouterr().err
 
 
+def with_palette(numbers: np.ndarray, *colors: tuple[int, int, int]) -> Image.Image:
+    image = Image.fromarray(np.asarray(numbers, np.uint8), "L").convert("P")
+    image.putpalette(bytes(value for color in colors for value in color))
+    return image
+
+
+BLACK, WHITE, RED, GREEN = (0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 200, 0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        pytest.param(with_palette(LABELS == 0, WHITE, BLACK), id="white is number 0"),
+        pytest.param(with_palette(np.choose(LABELS, [1, 0, 2]), RED, BLACK, GREEN), id="black is number 1"),
+        pytest.param(with_palette(LABELS, WHITE, RED, GREEN), id="on white paper"),
+        pytest.param(with_palette(LABELS, BLACK, BLACK, BLACK), id="without colors"),
+        pytest.param(with_palette(LABELS * 0, WHITE), id="white alone"),
+        pytest.param(colors_of(RED, GREEN).quantize(4), id="made smaller"),
+        pytest.param(Image.fromarray(np.dstack([LABELS, LABELS * 0 + 60, 70 * LABELS]), "RGB"), id="overlay"),
+    ],
+)
+def test_numbers_of_a_palette_are_labels_unless_its_colors_say_otherwise(tmp_path, image):
+    """Programs that make files smaller number the colors of a mask as they like."""
+    if image.mode == "RGB":  # as tools draw a mask over a picture: nowhere opaque
+        image.putalpha(Image.fromarray((153 * (LABELS > 0)).astype(np.uint8)))
+    image.save(tmp_path / "m.png")
+    whole = image.mode == "P" and image.getextrema() == (0, 0)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((LABELS > 0) | whole, 255, 0))
+
+
 def test_labels_in_a_webp_without_loss_are_labels(tmp_path):
     for name, words in (("a.webp", {}), ("b.webp", {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"})):
         Image.fromarray(LABELS).convert("RGB").save(tmp_path / name, lossless=True, **words)
@@ -420,7 +491,7 @@ def test_masks_that_cannot_be_told_are_refused(tmp_path, values, name, message):
         read_mask(tmp_path / name)
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency", "palette"])
 def test_a_soft_mask_stays_soft(tmp_path, kind):
     y, x = np.mgrid[:48, :64]
     soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
@@ -431,6 +502,7 @@ def test_a_soft_mask_stays_soft(tmp_path, kind):
         "floats": Image.fromarray(soft.astype(np.float32) / 255),
         "alpha": Image.fromarray(np.stack([soft * 0, soft], -1)),
         "transparency": Image.fromarray(soft).convert("P"),
+        "palette": Image.fromarray(soft).convert("RGB").quantize(256),
     }[kind]
     name, words = ("m.tif", {}) if kind == "floats" else ("m.png", {})
     words = {"transparency": bytes(range(256))} if kind == "transparency" else words

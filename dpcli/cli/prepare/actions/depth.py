@@ -33,16 +33,16 @@ class DepthCamera:
 
     def read_calibration(self) -> Calibration | None:
         """Returns the calibration that was given, None when it follows from `--fov`. Raises UsageError on a mixture."""
-        from dpcli.prepare.decode.calibration import Calibration, read_calibration
-        from dpcli.prepare.decode.pinhole_camera import Intrinsics
-
         pixels = (self.fx, self.fx if self.fy is None else self.fy, self.cx, self.cy)
         if self.intrinsics and any(v is not None for v in pixels):
             raise UsageError("--intrinsics and --fx --fy --cx --cy were both given; use one")
+        if not self.intrinsics and all(v is None for v in pixels):
+            return None
+        from dpcli.prepare.decode.calibration import Calibration, read_calibration
+        from dpcli.prepare.decode.pinhole_camera import Intrinsics
+
         if self.intrinsics:
             return read_calibration(self.intrinsics)
-        if all(v is None for v in pixels):
-            return None
         if any(v is None for v in pixels):
             raise UsageError("--fx, --cx and --cy belong together (--fy defaults to --fx); or use --fov")
         return Calibration(Intrinsics(*(float(v) for v in pixels if v is not None)))

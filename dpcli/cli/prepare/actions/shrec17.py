@@ -30,7 +30,9 @@ def shrec17(
     median: Annotated[
         Literal["0", "3", "5"], typer.Option("--median", help="Side of the median blur, pixels; 0 for none.")
     ] = "3",
-    close: Annotated[int, typer.Option("--close", min=0, help="Side of the closing, pixels; 0 for none.")] = 7,
+    close: Annotated[
+        int, typer.Option("--close", min=0, max=1000, help="Side of the closing, pixels; 0 for none.")
+    ] = 7,
     coordinates: PixelCoordinates = "image",
     conversion: ConversionOptions,
 ) -> None:

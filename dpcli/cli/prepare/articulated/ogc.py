@@ -41,8 +41,10 @@ class NewRoomOptions:
     objects: Annotated[str, typer.Option("--objects", help="Numbers of objects in new rooms, each from 2 to 8.")] = (
         "8,7,6,5,4"
     )
-    rooms: Annotated[int, typer.Option("--rooms", min=1, help="New rooms of each number of objects.")] = 1000
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of new rooms.")] = 4
+    rooms: Annotated[int, typer.Option("--rooms", min=1, max=100_000, help="New rooms of each number of objects.")] = (
+        1000
+    )
+    frames: Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Frames of new rooms.")] = 4
     up: Annotated[
         Literal["y", "z"], typer.Option("--up", help="Axis that points up in the meshes: y (ShapeNet) or z.")
     ] = "y"

@@ -11,15 +11,21 @@ from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 
 def gestures(
     *,
-    videos_per_class: Annotated[int, typer.Option("--videos-per-class", help="Videos of each of the 10 classes.")] = 20,
-    frames: Annotated[int, typer.Option("--frames", help="Frames per video; with a radar on average.")] = 24,
+    videos_per_class: Annotated[
+        int, typer.Option("--videos-per-class", max=100_000, help="Videos of each of the 10 classes.")
+    ] = 20,
+    frames: Annotated[
+        int, typer.Option("--frames", max=10_000, help="Frames per video; with a radar on average.")
+    ] = 24,
     subjects: Annotated[
         int,
         typer.Option(
-            "--subjects", help="People, of whom as many are seen as a class has videos; the first 60 % of them train."
+            "--subjects",
+            max=100_000,
+            help="People, of whom as many are seen as a class has videos; the first 60 % of them train.",
         ),
     ] = 10,
-    size: Annotated[int, typer.Option("--size", help="Image width, pixels; the height is 3/4 of it.")] = 160,
+    size: Annotated[int, typer.Option("--size", max=4096, help="Image width, pixels; the height is 3/4 of it.")] = 160,
     noise: Annotated[float, typer.Option("--noise", min=0.0, help="Sensor noise; 1 is like a Kinect's.")] = 1.0,
     sensor: Annotated[
         Literal["depth", "radar"],

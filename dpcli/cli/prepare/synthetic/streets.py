@@ -11,10 +11,10 @@ from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 
 def streets(
     *,
-    streets: Annotated[int, typer.Option("--streets", min=1, help="Streets, a sequence of each.")] = 10,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of a sequence.")] = 4,
+    streets: Annotated[int, typer.Option("--streets", min=1, max=100_000, help="Streets, a sequence of each.")] = 10,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Frames of a sequence.")] = 4,
     rows: Annotated[Literal["64", "32", "16"], typer.Option("--rows", help="Beams of the lidar.")] = "64",
-    movers: Annotated[int, typer.Option("--movers", min=0, help="The most bodies that move.")] = 6,
+    movers: Annotated[int, typer.Option("--movers", min=0, max=1000, help="The most bodies that move.")] = 6,
     rate: Annotated[float, typer.Option("--rate", help="Frames per second.")] = 10.0,
     speed: Annotated[float, typer.Option("--speed", help="The lidar's own highest speed, m/s.")] = 12.0,
     noise: Annotated[float, typer.Option("--noise", help="Noise of ranges (standard deviation), meters.")] = 0.02,

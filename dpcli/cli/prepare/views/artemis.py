@@ -32,7 +32,8 @@ class AnimalOptions:
     ] = ""
     train_cameras: Annotated[str, typer.Option("--train-cameras", help="Further cameras to fit to, such as 2,8.")] = ""
     tracks: Annotated[
-        int, typer.Option("--tracks", min=0, help="Points of the volume tracked as ground truth; 0: none.")
+        int,
+        typer.Option("--tracks", min=0, max=1_000_000, help="Points of the volume tracked as ground truth; 0: none."),
     ] = 4096
     fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0
     on_error: BadFrame = "stop"

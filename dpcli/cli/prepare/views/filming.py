@@ -41,7 +41,10 @@ class FilmingOptions:
     samples: Annotated[int, typer.Option("--samples", min=1, max=8, help="N x N rays per pixel.")] = 2
     shading: Annotated[float, typer.Option("--shading", help="0 plain colors .. 1 full light and shade.")] = 0.5
     tracks: Annotated[
-        int, typer.Option("--tracks", min=0, rich_help_panel=TRUTH, help="Surface points of ground truth; 0: none.")
+        int,
+        typer.Option(
+            "--tracks", min=0, max=1_000_000, rich_help_panel=TRUTH, help="Surface points of ground truth; 0: none."
+        ),
     ] = 4096
     part_tolerance: Annotated[
         float,

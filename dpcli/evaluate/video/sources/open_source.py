@@ -8,6 +8,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import ArraySource, FolderSource, VideoSource
 from dpcli.evaluate.video.sources.source import Source
 from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
+from dpcli.regular_files import why_unreadable
 from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES
 from dpcli.store import file_kind
 
@@ -34,7 +35,7 @@ def open_source(path: Path, *, truth: Source | None = None) -> Source:
     if path.is_dir():
         return FolderSource(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file or folder; {_EXPECTED}")
+        raise DataError(f"{path}: {why_unreadable(path) or 'no such file or folder'}; {_EXPECTED}")
     if path.suffix.lower() == ".npy":
         return ArraySource(path)
     if _is_clip(path):

@@ -17,7 +17,9 @@ class ShapeSchedule:
     steps: int = setting(20_000, "Steps of the optimizer.", least=1)
     batch: int = setting(64, "Pictures per step, in which the turn of the whole is learned.", least=1)
     decoded: int = setting(16, "Pictures of each step in which the layers are learned, too: the easier part.", least=1)
-    size: int = setting(64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16)
+    size: int = setting(
+        64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16, most=1024
+    )
     lr: float = setting(2e-3, "Largest learning rate; it falls to zero as a cosine.", above=0)
     round: int = setting(1024, "Pictures that are made at a time; a training begins with four times as many.", least=1)
     rounds: int = setting(24, "Rounds of pictures that are kept.", least=1)

@@ -13,6 +13,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
 from dpcli.evaluate.video.psnr import PSNR_CAP
 from dpcli.evaluate.video.sources.open_source import open_source
+from dpcli.runtime.progress import log
 from dpcli.store.gaussians import write_scene
 from tests.support.scenes import toy_scene
 from tests.support.video_clips import HEIGHT, WIDTH, clip, header, white, write, write_folder
@@ -142,3 +143,14 @@ def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
     flat = write_folder(tmp_path / "flat", clip()[0])
     with pytest.raises(DataError, match="a folder of images has no cameras to render"):
         evaluate_video(scene, flat)
+
+
+def test_weights_that_no_metric_needs_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, said = write(tmp_path / "one.h5", clip(views=1, frames=2), header(("reference",), 2)), []
+    monkeypatch.setattr(log, "warn", said.append)
+    evaluate_video(path, path, metrics=["psnr", "warping"])
+    assert not said
+    evaluate_video(path, path, metrics=["psnr"], weights=tmp_path)
+    assert said == [f"--weights {tmp_path}: nothing in it is read; none of the metrics asked for needs a network"]
+    with pytest.raises(DataError, match="no such folder"):
+        evaluate_video(path, path, metrics=["psnr"], weights=tmp_path / "nowhere")

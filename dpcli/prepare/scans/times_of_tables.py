@@ -1,0 +1,173 @@
+"""Times that columns of tables tell: seconds and their parts, dates, times of day, durations, in units that names say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.column_names import words_of
+
+_UNITS = (
+    (1.0, "s sec secs second seconds"),
+    (1e-3, "ms msec msecs milli millis millisec millisecs millisecond milliseconds"),
+    (1e-6, "us usec usecs micro micros microsec microsecs microsecond microseconds"),
+    (1e-9, "ns nsec nsecs nano nanos nanosec nanosecs nanosecond nanoseconds"),
+    (60.0, "minute minutes"),
+    (3600.0, "hour hours hr hrs"),
+)
+_SECONDS = {word: size for size, words in _UNITS for word in words.split()}
+_IN_BRACKETS = {"min": 60.0, "mins": 60.0, "h": 3600.0}  # which mean something else without
+_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
+_LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
+_TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
+_NO_UNITS = _TIME_WORDS | {"gps", "unix", "posix", "local", "sensor", "since", "start"}
+_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?\s*$")
+_CLOCK = re.compile(
+    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(\d+) days?,? )?(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
+    re.IGNORECASE,
+)
+_DAY = 86_400.0
+
+
+class Table(Protocol):
+    """Offers the columns of a table, as `text_numbers.TextTable` and `parquet.ParquetTable` do."""
+
+    path: Path
+    names: tuple[str, ...]
+
+    def columns(self, places: list[int]) -> np.ndarray:
+        """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
+        ...
+
+    def words(self, place: int) -> list[str]:
+        """Returns the cells of a column as text, "" of an empty one."""
+        ...
+
+    def moments(self, place: int) -> np.ndarray | None:
+        """Returns the seconds f64 (N) of a column whose type is time; None of other types, such as texts."""
+        ...
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Holds the seconds f64 (N) of each row of a table, as columns told them that don't number the frames: one, or one of
+    seconds and one of their parts.
+    """
+
+    columns: tuple[str, ...]
+    seconds: np.ndarray
+
+
+def seconds_of(column: str, values: np.ndarray) -> float:
+    """Returns how many seconds one unit of a column is that holds times; 0 where its values f64 (T) count frames, or the unit
+    isn't known.
+
+    >>> seconds_of("frame", np.array([1.0, 2.0])), seconds_of("t_ms", np.array([0.0, 33.0]))
+    (0.0, 0.001)
+    >>> seconds_of("t [ticks]", np.array([0.5, 1.0])), seconds_of("t [µs]", np.array([0.5, 1.0]))
+    (0.0, 1e-06)
+    """
+    words = words_of(column)
+    if len(words) > 1 and words[-1] in _SECONDS:
+        return _SECONDS[words[-1]]
+    if set(words) & _TIME_WORDS and (inside := _BRACKETS.search(column)):
+        told = words_of(inside[1])
+        if not set(told) <= _NO_UNITS:
+            return _IN_BRACKETS.get(" ".join(told), 0.0)
+    if not (values == np.floor(values)).all():
+        return 1.0
+    digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
+    unit = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 and set(words) & _TIME_WORDS else 0.0
+    steps = np.diff(np.unique(values)) if unit else values[:0]
+    return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
+
+
+def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:
+    """Returns the times that some of the columns ``names`` tell, in seconds or of a unit in the column's name."""
+    found = []
+    for name in names:
+        if clock := seconds_and_parts(table, name):
+            found.append(clock)
+        elif set(words_of(name)) & _TIME_WORDS and (clock := _one_column(table, name)):
+            found.append(clock)
+    return found
+
+
+def seconds_and_parts(table: Table, name: str) -> Clock | None:
+    """Returns the clock of a column of whole seconds beside which another, called alike, holds their parts, as
+    ``stamp.sec`` and ``stamp.nanosec``; None without it.
+    """
+    words = words_of(name)
+    if not words or _SECONDS.get(words[-1]) != 1:
+        return None
+    for other in table.names:
+        *rest, unit = words_of(other) or [""]
+        if rest != words[:-1] or _SECONDS.get(unit, 1) >= 1:
+            continue
+        try:
+            values = table.columns([table.names.index(name), table.names.index(other)])
+        except DataError:
+            continue
+        seconds, parts = values[:, 0], values[:, 1] * _SECONDS[unit]
+        if len(values) and (seconds == np.floor(seconds)).all() and ((parts >= 0) & (parts < 1)).all():
+            return Clock((name, other), seconds - seconds[0] + parts)
+    return None
+
+
+def _one_column(table: Table, name: str) -> Clock | None:
+    place = table.names.index(name)
+    seconds = table.moments(place)
+    if seconds is None:
+        try:
+            values = table.columns([place])[:, 0]
+        except DataError:
+            seconds = np.array(clock_seconds(table.words(place)))
+        else:
+            unit = seconds_of(name, values) if len(values) and np.isfinite(values).all() else 0.0
+            seconds = (values - values[0]) * unit if unit else values[:0]
+    return Clock((name,), seconds) if len(seconds) and np.isfinite(seconds).all() else None
+
+
+def clock_seconds(words: Sequence[str]) -> list[float]:
+    """Returns the seconds of dates with times of day, or of times of day alone, which may pass midnight; [] of other words.
+
+    >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["1 days 00:00:01"]), clock_seconds(["a"])
+    ([86399.5, 86400.0], [86401.0], [])
+    """
+    found: list[float] = []
+    days = 0
+    for word in words:
+        match = _CLOCK.fullmatch(word.strip())
+        try:
+            seconds = _seconds_told(match) if match else None
+        except ValueError:  # such as a month 13
+            seconds = None
+        if match is None or seconds is None:
+            return []
+        if match[1] is None and match[4] is None:
+            days += bool(found) and seconds + days * _DAY < found[-1] - _DAY / 2
+        found.append(seconds + days * _DAY)
+    return found
+
+
+def _seconds_told(match: re.Match[str]) -> float:
+    year, month, day, days, hour, minute, second, fraction, _ = match.groups()
+    own = int(hour) * 3600 + int(minute) * 60 + int(second) + float((fraction or ".0").replace(",", "."))
+    if year is None:
+        return own + int(days or 0) * _DAY
+    return datetime(int(year), int(month), int(day), tzinfo=timezone.utc).timestamp() + own - _offset(match[9])
+
+
+def _offset(zone: str | None) -> float:
+    """Returns the seconds by which a zone such as ``+02:00`` is ahead."""
+    if not zone or zone[0] not in "+-":
+        return 0.0
+    ahead = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
+    return float(-ahead if zone[0] == "-" else ahead)

@@ -1,0 +1,114 @@
+"""Times and frames that columns of tables tell: units in names, seconds and their parts, types of times, exact numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.prepare.scans.tables import TableSequences
+
+RNG = np.random.default_rng(0)
+
+
+def only_sequence(path, **options):
+    reader = TableSequences(path, **options)
+    (item,) = reader.items()
+    assert not item.problem
+    return reader.read(item, RNG).sequence, reader.summary([item])[0]
+
+
+def csv(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("t [µs]", [0.0, 50_000.5], [0, 0.0500005]),
+        ("t [μs]", [0, 50_000], [0, 0.05]),  # the other letter
+        ("time_msec", [0.25, 33.75], [0, 0.0335]),
+        ("timestamp_millis", [0, 40], [0, 0.04]),
+        ("TIMESTAMP (nanoseconds)", [5 * 10**8, 6 * 10**8], [0, 0.1]),
+        ("time (min)", [0.25, 0.75], [0, 30]),
+        ("time [h]", [0.5, 0.75], [0, 900]),
+        ("time (UTC)", [0.5, 0.75], [0, 0.25]),
+        ("time [ticks]", [0.5, 0.75], None),
+        ("timestamp", [1_234_567_890, 1_234_617_890], None),  # microseconds since the sensor began
+        ("timestamp", [1_700_000_000, 1_700_000_030], [0, 30]),
+        ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
+        ("time", ["1 day, 0:00:01", "2 days, 0:00:01"], [0, 86400]),
+    ],
+)
+def test_units_in_the_names_of_times(tmp_path, name, values, expected):
+    rows = [(frame, value, k, 1, 2) for frame, value in enumerate(values) for k in (1, 2)]
+    if any("," in str(value) for value in values):
+        rows = [(frame, f'"{value}"', *rest) for frame, value, *rest in rows]
+    sequence, about = only_sequence(csv(tmp_path / "a.csv", f"frame,{name},x,y,z", rows))
+    if expected is None:
+        assert sequence.time is None and name in about.split("not read: ")[1]
+    else:
+        np.testing.assert_allclose(sequence.time, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "parts"),
+    [("stamp.sec,stamp.nanosec", 1e9), ("secs,nsecs", 1e9), ("ts_sec,ts_usec", 1e6), ("time_s,time_ms", 1e3)],
+)
+def test_seconds_and_their_parts_are_one_time(tmp_path, names, parts):
+    moments = [(10, 0.9), (11, 0.1), (12, 0.05)]  # the seconds alone would rise, too
+    rows = [(f, s, round(p * parts), k, 1, 2) for f, (s, p) in enumerate(moments) for k in (1, 2)]
+    path = csv(tmp_path / "a.csv", f"frame,{names},x,y,z", rows)
+    first, second = names.split(",")
+    sequence, about = only_sequence(path)
+    np.testing.assert_allclose(sequence.time, [0, 0.2, 1.15], atol=1e-6)
+    assert f"times by column {first!r} and {second!r}" in about and "not read" not in about
+    sequence, _ = only_sequence(path, frame_column=first)
+    np.testing.assert_allclose(sequence.time, [0, 0.2, 1.15], atol=1e-6)
+
+
+def test_names_of_frames_in_the_order_of_the_alphabet_are_put_in_that_of_their_numbers(tmp_path):
+    names = sorted(f"frame_{k}.pcd" for k in range(12))
+    path = csv(tmp_path / "a.csv", "frame,x,y,z", [(name, int(name[6:-4]), 1, 2) for name in names])
+    assert only_sequence(path)[0].points[:, 0].tolist() == list(range(12))
+    logged = [f"frame_{k}.pcd" for k in (8, 9, 10, 1)]
+    path = csv(tmp_path / "b.csv", "frame,x,y,z", [(name, int(name[6:-4]), 1, 2) for name in logged])
+    assert only_sequence(path)[0].points[:, 0].tolist() == [8, 9, 10, 1]
+    csv(tmp_path / "c.csv", "frame,x,y,z", [("a", 1, 1, 1), ("", 1, 1, 1)])
+    (item,) = TableSequences(tmp_path / "c.csv").items()
+    assert "1 rows, the first is 2, have no number in 'frame'" in item.problem
+
+
+@pytest.mark.parametrize("first", [2**53, 1_709_640_000_123_456_789, 2**64 - 9])
+def test_numbers_that_no_float_holds_stay_apart(tmp_path, first):
+    rows = [(first + k, k, 1, 2) for k in range(4)]
+    sequence, _ = only_sequence(csv(tmp_path / "a.csv", "frame,x,y,z", rows), fps=10)
+    assert sequence.num_frames == 4
+    np.testing.assert_allclose(sequence.time, [0, 0.1, 0.2, 0.3])
+
+
+def test_numbers_of_frames_in_groups_of_thousands(tmp_path):
+    rows = [(f'"1,{k:03d}"', k + 0.5, 1, 2) for k in range(3)]
+    np.testing.assert_allclose(
+        only_sequence(csv(tmp_path / "a.csv", "frame,x,y,z", rows), fps=10)[0].time, [0, 0.1, 0.2]
+    )
+
+
+@pytest.mark.parametrize("kind", ["timestamp[s]", "timestamp[ns]", "duration[ms]", "time32[s]", "time64[us]", "int64"])
+def test_types_of_times_are_times_whatever_their_columns_are_called(tmp_path, kind):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    parts = {"s]": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}.get(kind[-3:-1] if kind[-3] != "[" else "s]", 1)
+    name, unit = kind.rstrip("]").split("[") if "[" in kind else ("", "")
+    made = {"timestamp": lambda: pyarrow.timestamp(unit, "Europe/Berlin"), "duration": lambda: pyarrow.duration(unit)}
+    made |= {"time32": lambda: pyarrow.time32(unit), "time64": lambda: pyarrow.time64(unit), "": pyarrow.int64}
+    moments = pyarrow.array([parts * s for s in (5, 5, 7)], pyarrow.int32() if name == "time32" else pyarrow.int64())
+    x = np.array([1.0, 2, 3])
+    table = pyarrow.table({"recorded": moments.cast(made[name]()), "x": x, "y": x, "z": x, "run": [7, 7, None]})
+    parquet.write_table(table, tmp_path / "a.parquet")
+    sequence, _ = only_sequence(tmp_path / "a.parquet", frame_column="recorded")
+    assert sequence.num_frames == 2
+    assert sequence.time is None if kind == "int64" else sequence.time.tolist() == [0, 2]
+    (item,) = TableSequences(tmp_path / "a.parquet", frame_column="recorded", sequence_column="run").items()
+    assert "a row has nothing in its column 'run'" in item.problem
