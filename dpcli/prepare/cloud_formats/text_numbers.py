@@ -246,7 +246,9 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
 
     may_be_empty: names without rows are a table, too, such as of a moment in which a radar saw nothing.
     """
-    text = decode_text(path).replace("\u2212", "-")  # the minus of typographers, as some languages' numbers have it
+    text = decode_text(path)
+    if not text.isascii():
+        text = text.replace("\u2212", "-")  # the minus of typographers, as some languages' numbers have it
     head = list(enumerate(text.split("\n", _HEAD)[:_HEAD], 1))
     head = [(k, line.strip(_EDGES)) for k, line in head if line.strip()]
     if not head:
