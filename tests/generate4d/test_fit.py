@@ -158,7 +158,7 @@ def test_what_is_wrong_is_said(tmp_path, dpc_here):
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
         (
-            2,
+            3,
             "--prior-model nosuch: no such file",
             (views, "-o", tmp_path / "a.h5", "--prior", "network", "--prior-model", "nosuch"),
         ),

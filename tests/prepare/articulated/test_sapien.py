@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, study
 from dpcli.prepare.articulated.sapien import Sapien, find_objects
-from dpcli.prepare.articulated.urdf import load_object, read_skeleton
+from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 from tests.support.articulated_helpers import CUBE_OBJ, box, cabinet, joint, link, write_urdf
@@ -461,11 +461,15 @@ def test_names_of_ros_packages_and_of_browsers(tmp_path):
     assert not Sapien(path, allow_outside=True).items()[0].problem
 
 
-def test_names_written_on_windows(tmp_path):
+@pytest.mark.parametrize("name", ["meshes\\c.obj", "Meshes/C.OBJ", "package://robot/MESHES/c.Obj"])
+def test_names_written_on_windows(name, tmp_path):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "c.obj").write_text(CUBE_OBJ)
-    elements = [link("a", '<mesh filename="meshes\\c.obj"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
-    assert len(load(write_urdf(tmp_path / "r.urdf", *elements)).triangles) == 24
+    elements = [link("a", f'<mesh filename="{name}"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    path = write_urdf(tmp_path / "r.urdf", *elements)
+    assert len(load_object(read_skeleton(path, tmp_path)).triangles) == 24
+    (tmp_path / "meshes" / "C.obj").write_text("")  # now capitals tell two files apart
+    assert ("\\" in name) != bool(missing_meshes(read_skeleton(path, tmp_path)))
 
 
 def test_meshes_as_windows_and_old_programs_write_them(tmp_path):

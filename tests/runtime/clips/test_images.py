@@ -13,6 +13,7 @@ from PIL import Image
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.name_numbers import in_order
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -210,3 +211,24 @@ def test_names_that_may_mean_two_times_are_told(names, words, tmp_path, capfd):
     in_order([tmp_path / name for name in names])
     told = capfd.readouterr().err
     assert words in told if words else not told
+
+
+@pytest.mark.parametrize("kind", ["webp", "png", "tif", "preview.tif"])
+def test_files_of_several_pictures_are_no_frames(tmp_path, kind):
+    """A folder of stickers is no clip of their first pictures; a TIFF may hold a smaller one of itself."""
+    pictures = [Image.new("RGB", (40, 30), (9 * k, 0, 0)) for k in range(3)]
+    pictures = [pictures[0], pictures[0].resize((20, 15))] if kind == "preview.tif" else pictures
+    for number in range(2):
+        pictures[0].save(tmp_path / f"{number}.{kind}", save_all=True, append_images=pictures[1:])
+    for read in (
+        lambda: next(open_frames(tmp_path).read([0])),
+        lambda: read_mask(tmp_path / f"0.{kind}"),
+        lambda: FolderSource(tmp_path),
+    ):
+        if kind == "preview.tif":
+            read()
+            continue
+        with pytest.raises(
+            DataError, match=f"0.{kind}: 3 pictures in one file; an animation is a clip itself, name it"
+        ):
+            read()
