@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 
-_ADDRESS = re.compile(r"\s+/|\s*([A-Za-z]:|file:|[A-Za-z][A-Za-z0-9+.-]*://)", re.IGNORECASE)
+_ABSOLUTE = re.compile(r"\s*(/|[A-Za-z]:|file:|[A-Za-z][A-Za-z0-9+.-]*://)", re.IGNORECASE)
 _LONGEST = 4095  # bytes of a path and, below, 255 of a name: Linux takes no more
 
 
@@ -47,19 +47,17 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
 def path_inside(root: Path | None, folder: Path, name: str) -> Path:
     """Returns where ``name``, which stands in a file, lies below ``folder``; nothing is opened.
 
-    A backslash is a slash, as in names written on Windows; an absolute path, or ``file://`` with one, may name what lies in
-    ``root``. Raises DataError when it leaves ``root``: by ``..``, as such a path, through a link, with a drive or as another
-    address. root None: it may.
+    A backslash is a slash, as in names written on Windows. Raises DataError when it leaves ``root``: by ``..``, as an
+    absolute path, with a drive or as an address (``file://``), or through a link. root None: it may.
     """
     plain = name.replace("\\", "/")
     if not _can_be(str(folder / plain)):
         raise DataError(f"the name {name[:80]!r} cannot be a file's; expected a path below {as_utf8(str(folder))}")
-    plain = plain.removeprefix("file://")
-    place = folder / plain
     if root is None:
-        return place
+        return folder / plain.removeprefix("file://")
+    place = folder / plain
     try:
-        inside = not _ADDRESS.match(plain) and place.resolve().is_relative_to(root.resolve())
+        inside = not _ABSOLUTE.match(plain) and place.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError):  # a circle of links
         inside = False
     if not inside:

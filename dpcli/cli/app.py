@@ -185,7 +185,7 @@ def _checking_values(command: Any) -> Any:
         return command
     options = {one.name: one for one in command.params}
     for one in command.params:
-        one.type_descriptor.parameter_info.readable = False  # typer would call it wrong use; see below
+        one.type_descriptor.parameter_info.readable = False  # typer would call it wrong use
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:

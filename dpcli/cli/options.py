@@ -35,7 +35,9 @@ Seed = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option("--jobs", min=1, rich_help_panel=RUNNING, help="Processes. Default: the CPUs this process may use."),
+    typer.Option(
+        "--jobs", min=1, max=1024, rich_help_panel=RUNNING, help="Processes. Default: the CPUs this process may use."
+    ),
 ]
 Device = Annotated[str, typer.Option("--device", rich_help_panel=RUNNING, help="auto, cpu, cuda or cuda:N.")]
 OnError = Annotated[

@@ -38,6 +38,7 @@ class SpreadOptions:
         typer.Option(
             "--jobs",
             min=1,
+            max=1024,
             rich_help_panel=RUNNING,
             help="Processes. Default: as many CPUs as make it faster; one on a GPU.",
         ),

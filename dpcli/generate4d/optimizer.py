@@ -79,7 +79,7 @@ class SceneOptimizer:
             self.model = Model4D(gaussians, self.config)
             field = self.model.field
             if self.config.seeds:
-                field.start_parts(mean, spread_seeds(mean, self.config.parts))
+                field.start_parts(mean, spread_seeds(mean, self.config.blended_parts))
             else:
                 field.update_centers(mean)
         self.model.to(self.device)

@@ -33,7 +33,9 @@ class RenderSettings:
         None, "Vertical field of view, degrees; none: the reference camera's.", above=0, below=180
     )
     size: int | None = setting(None, "Longer side of a picture, pixels; none: that of the fit.", least=8, most=8192)
-    frames: int | None = setting(None, "Number of pictures; none: whole loops of the clip, about 4 seconds.", least=1)
+    frames: int | None = setting(
+        None, "Number of pictures; none: whole loops of the clip, about 4 seconds.", least=1, most=100_000
+    )
     fps: float | None = setting(
         None, "Pictures per second; none: the clip's own rate, or a multiple of it.", least=1, most=120
     )

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -56,11 +56,12 @@ def _room(place: str | Path | None, needed: int) -> str:
     from rich.filesize import decimal
 
     parts = [f"about {decimal(needed)} needed"] if needed else []
-    above = [Path(place).absolute(), *Path(place).absolute().parents] if place else []
-    folder = next((one for one in above if one.is_dir()), None)
-    if folder is not None:
-        disk = shutil.disk_usage(folder)
-        parts.append(f"{decimal(disk.free)} of {decimal(disk.total)} free in {folder}")
+    named = isinstance(place, (str, Path)) and place  # the system names a file by its number, too
+    above = [Path(place).absolute(), *Path(place).absolute().parents] if named else []
+    with suppress(OSError):
+        if folder := next((one for one in above if one.is_dir()), None):
+            disk = shutil.disk_usage(folder)
+            parts.append(f"{decimal(disk.free)} of {decimal(disk.total)} free in {folder}")
     return f" ({', '.join(parts)})" if parts else ""
 
 

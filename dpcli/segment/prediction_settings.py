@@ -37,7 +37,7 @@ class Refinement:
         512, "Points of a frame that the segmenter sees; its answer is carried back to all points.", least=32
     )
     pairs: Literal["adjacent", "all"] = setting("adjacent", "Pairs of frames whose motions are found.")
-    icp: int = setting(20, "Steps of object-aware ICP that refine the motions.", least=0)
+    icp: int = setting(20, "Steps of object-aware ICP that refine the motions.", least=0, most=1000)
     vote: bool = setting(True, "Blend each frame's mask with its neighbors', carried along the flow.")
     split_bodies: bool = setting(True, "Divide a part of the network's whose points move as several rigid bodies.")
     smallest: float = setting(

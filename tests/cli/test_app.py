@@ -169,6 +169,9 @@ def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
 )
 def test_a_full_disk_is_no_bug(number, said, capsys):
     assert cli._explain(OSError(number, "of the system")) == 1 and said in capsys.readouterr().err
+    assert cli._explain(OSError(errno.ENXIO, "No such device", "socket")) == 3  # what lies there can't be opened
+    assert cli._explain(OSError(number, "of the system", 3)) == 1  # the system may name a file by its number
+    assert "3: " in capsys.readouterr().err
 
 
 REPLACING = [

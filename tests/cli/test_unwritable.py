@@ -20,6 +20,7 @@ from dpcli.runtime.whole_file import DiskFull
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from dpcli.store.pipes import check_output
 from dpcli.store.writing.journal import Journal
+from tests.support.commands import exit_code
 from tests.support.prepare_helpers import ROOT
 
 COMMANDS = [
@@ -266,3 +267,21 @@ def test_the_sample_that_found_no_room_is_not_counted_as_kept(tmp_path, monkeypa
         writer.write(CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2))
         monkeypatch.setattr(Journal, "append", full)
         writer.write(CloudSequence.from_frames("b", [np.ones((4, 3), np.float32)] * 2))
+
+
+@pytest.mark.parametrize("words", ["prepare clouds R -o o.h5", "prepare depth a.npy --labels R -o o.h5", "info R"])
+def test_an_input_that_nobody_may_read_is_bad_data_everywhere(words, tmp_path, monkeypatch, capsys):
+    """Where the parser finds it, too, which would call it wrong use."""
+    monkeypatch.chdir(tmp_path)
+    np.save("a.npy", np.ones((2, 4, 4), np.uint16))
+    (tmp_path / "R").write_bytes(b"")
+    may, opened = os.access, open
+    monkeypatch.setattr(os, "access", lambda path, mode: may(path, mode) and os.path.basename(path) != "R")
+
+    def refused(path, *more, **named):
+        if os.path.basename(str(path)) == "R":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *more, **named)
+
+    monkeypatch.setattr("builtins.open", refused)
+    assert exit_code(*words.split()) == 3 and "R: permission denied" in capsys.readouterr().err

@@ -35,6 +35,11 @@ def test_a_long_title_stays_on_the_page() -> None:
     assert page.shape[1] == 40 + 2 * GAP and (page[GAP : GAP + TITLE_HEIGHT, -GAP:] == DARK.page).all()
 
 
+def test_a_name_of_several_lines_is_drawn_in_one() -> None:
+    pages = [np.asarray(contact_sheet([SheetRow(title, [""], cells(1, 0))])) for title in ("a\nb", "a\\nb")]
+    np.testing.assert_array_equal(*pages)
+
+
 def test_a_sheet_of_nothing_is_refused() -> None:
     for rows in ([], [SheetRow("empty", [], [])]):
         with pytest.raises(DataError, match="at least one picture"):

@@ -3,8 +3,8 @@
     python -m tests.fuzz.fuzz_options FOLDER [--only WORD]
 
 makes small data in FOLDER, then runs each command again and again in processes of their own, with 14 GB and a minute at
-most. Prints what ended by a trace, a signal or the sentence that asks for --debug, and exits with 1 if anything did. A
-command that runs into its minute did what it was asked for (10^11 steps).
+most. Prints what ended by a trace, a signal, for want of memory, or with the sentence that asks for --debug, and exits
+with 1 if anything did. A command that runs into its minute did what it was asked for (10^11 steps).
 """
 
 from __future__ import annotations
@@ -125,7 +125,8 @@ def odd_settings(words: Sequence[str]) -> Iterator[list[str]]:
 
 
 def is_bug(code: int, said: str) -> bool:
-    return "a bug, or" in said or "Traceback" in said or (code < 0 and code != -signal.SIGALRM)
+    found = ("a bug, or", "Traceback", "not enough memory")
+    return any(one in said for one in found) or (code < 0 and code != -signal.SIGALRM)
 
 
 def forced(line: str) -> list[str]:

@@ -203,6 +203,12 @@ def test_other_counts_of_meshes_are_refused(kind, change, tmp_path):
         shape_of(path)
 
 
+def test_an_stl_that_ends_within_its_header_is_refused(tmp_path):
+    (tmp_path / "a.stl").write_bytes(_mesh("stl")[:60])
+    with pytest.raises(DataError, match="a.stl: truncated: its header alone has 84 bytes, it holds 60"):
+        shape_of(tmp_path / "a.stl")
+
+
 @pytest.mark.parametrize("behind", [b"\r\n", b"made by a program", bytes(100)])
 def test_bytes_behind_the_triangles_of_an_stl_are_passed_over_and_told(behind, tmp_path, capfd):
     path, data = tmp_path / "a.stl", _mesh("stl")

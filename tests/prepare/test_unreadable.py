@@ -15,13 +15,18 @@ import pytest
 from PIL import Image
 
 from dpcli.errors import DataError, DpcError
+from dpcli.prepare.actions.depth import find_videos
+from dpcli.prepare.actions.ntu60 import NTU60
 from dpcli.prepare.cloud_formats.arrays import read_npz
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
 from dpcli.prepare.reader import Item
+from dpcli.prepare.recordings.recording import find_recordings
+from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.prepare.thinning import Thinning
 from dpcli.regular_files import regular_files_only
+from tests.support.commands import exit_code
 from tests.support.prepare_helpers import ToyReader, dpc, write_video
 
 
@@ -237,3 +242,49 @@ def test_an_avi_gives_what_its_header_promises_or_says_what_is_missing(tmp_path,
         told += missing > 0
         assert missing > 0 or len(frames) >= len(depth[:-1:stride])
     assert told >= 3
+
+
+@pytest.fixture
+def as_somebody_else(tmp_path, monkeypatch):
+    """The folder of the test is the current one, and this process nobody's, where it was root's, who may read everything."""
+    tmp_path.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    yield lambda: os.seteuid(65534) if os.geteuid() == 0 else None
+    os.seteuid(os.getuid())
+    (tmp_path / "raw" / "closed").chmod(0o755)
+
+
+@pytest.mark.parametrize("find", [find_videos, find_recordings, lambda path: list(CloudFolders(path).items())])
+def test_a_folder_that_nobody_may_enter_hides_no_other(find, as_somebody_else):
+    for name in ("closed", "open"):
+        (Path("raw") / name).mkdir(parents=True)
+        np.save(Path("raw") / name / "0.npy", np.ones((5, 4, 3), np.uint16))
+    (Path("raw") / "closed").chmod(0)
+    as_somebody_else()
+    found = find(Path("raw"))
+    assert len(found) == (0 if find is find_recordings else 1)
+    assert [(path.name, why) for path, why in unreadable_entries(Path("raw"), set())] == [
+        ("closed", "cannot be listed (Permission denied)")
+    ]
+
+
+def test_a_link_in_a_circle_among_videos_is_passed_over(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "S001C002P003R001A060").mkdir()
+    assert [item.name for item in NTU60((tmp_path,)).items()] == ["S001C002P003R001A060"]
+
+
+def test_folders_deeper_than_can_be_listed_are_no_bug(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("a.npy", np.ones((5, 3)))
+    deepest = os.open(".", os.O_RDONLY)
+    for _ in range(1100):
+        os.mkdir("d", dir_fd=deepest)
+        above, deepest = deepest, os.open("d", os.O_RDONLY, dir_fd=deepest)
+        os.close(above)
+    os.close(deepest)
+    try:
+        code = exit_code("prepare", "clouds", ".", "-o", "../o.h5")
+    finally:
+        subprocess.run(["rm", "-r", "d"], check=True)  # Python's own removal calls itself as deep
+    assert code in (0, 3) and "a bug" not in capsys.readouterr().err  # newer Pythons list without calling themselves

@@ -21,7 +21,7 @@ from dpcli.errors import UsageError
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
-_PROBE, _HEAD = 3, 12  # videos a class, at most, for which the last layers alone, or the heads alone, learn
+_PROBE, _HEAD = 3, 20  # videos a class, at most, for which the last layers alone, or the heads alone, learn
 _CLIPS = {"probe": 3000, "head": 5000, "all": 9000}  # that each stream sees in all
 _RATE = 6e-3  # of heads and last layers: at a sixth of it the dynamic stream lagged 20 points behind what it can learn
 _EPOCHS = 5, 100  # at least, at most, of what is frozen but for its last layers
@@ -59,7 +59,7 @@ def _schedule(preset: Schedule, part: str, videos: int) -> Schedule:
     """Returns how long and how fast a part of a network learns from so many videos.
 
     Where everything learns, it is at the preset's rate and for up to its epochs, since a slower or shorter training ends below
-    one from nothing.
+    one from nothing. So is what learns of a network for sparse clouds, whose rate was not tried.
     """
     epochs = []
     for own in preset.stage_epochs:
@@ -69,7 +69,7 @@ def _schedule(preset: Schedule, part: str, videos: int) -> Schedule:
         preset,
         epochs=epochs[0],
         epochs_dynamic=epochs[1],
-        learning_rate=preset.learning_rate if part == "all" else _RATE,
+        learning_rate=_RATE if part != "all" and preset.epochs_dynamic else preset.learning_rate,
         fine_tune=part,
         validate_every=max(1, epochs[0] // 10),
     )

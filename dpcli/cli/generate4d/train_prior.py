@@ -24,7 +24,9 @@ def train_prior(
         typer.Argument(help="Models (.glb, .gltf) or folders of them; none: made-up creatures alone."),
     ] = None,
     seed: Seed = 0,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes that make pictures; 1: between the steps.")] = 2,
+    jobs: Annotated[
+        int, typer.Option("--jobs", min=1, max=1024, help="Processes that make pictures; 1: between the steps.")
+    ] = 2,
     force: Force = False,
 ) -> None:
     """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures.

@@ -13,7 +13,7 @@ from dpcli.cli.help_groups import RUNNING
 from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
-from dpcli.errors import UsageError
+from dpcli.errors import UsageError, reading
 from dpcli.runtime.worker_server import ensure_server
 from dpcli.standard_streams import printable
 
@@ -55,13 +55,18 @@ def run_conversion(
 
     name: the command's, which is also its recipe's. raw: the folder that `--check` compares with the recipe.
     """
+
+    def made() -> Any:
+        with reading(raw or f"prepare {name}"):  # some look into the folder to choose how it is read
+            return make_reader()
+
     if options.check:
-        print_check(name, raw, make_reader)
+        print_check(name, raw, made)
         return
     require_output(options.output)
     if options.jobs != 1 and not options.dask:
         ensure_server("dpcli.prepare.convert_item")  # while libraries load here and the folder is listed
-    reader = make_reader()
+    reader = made()
     from dpcli.prepare.commands.convert import convert_raw_data
     from dpcli.prepare.pipeline import Conversion
     from dpcli.runtime.machines import shards

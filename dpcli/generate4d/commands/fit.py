@@ -73,7 +73,7 @@ def fit_scene(
         scene = to_scene(model, targets, metrics)
         _write(output, scene, targets, provenance.record(record, seed, {"views": path}), seed, force)
         if picture is not None:
-            write_preview(model, targets, picture)
+            write_preview(scene, targets, picture)  # its parts are those of the file
     log.info(
         f"reference view {metrics['psnr_reference']:.2f} dB PSNR, {metrics['gaussians']} Gaussians,"
         f" {metrics['seconds']:.0f} s"

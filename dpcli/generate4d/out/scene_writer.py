@@ -8,22 +8,29 @@ from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.model import Model4D
+from dpcli.generate4d.scene.rigid_parts import find_parts, trust
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
 from dpcli.ops.rotations import normalize_quaternion
 from dpcli.store.gaussians import GaussianScene
+
+_SOLID = 0.1  # opacity of a Gaussian whose motion counts; fainter ones float anywhere
 
 
 @torch.no_grad()
 def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     """Returns every frame's Gaussians, their parts and how those move.
 
-    A part's motion is the one that best explains where its Gaussians went (weighted Kabsch, weights part probability
+    Parts are found again on the whole motion, but where the settings leave the temporal cue out: those of its network
+    then stand. A part's motion is the one that best explains where its Gaussians went (weighted Kabsch, weights part probability
     times opacity), which is also what a fit without rigid motion can be asked for.
     """
     gaussians, control = model.gaussians, model.control
     motion = _motion_of_frames(model, targets)
-    probability, frame_mean = motion["part"].mean(0), motion["mean"]
+    frame_mean, solid = motion["mean"], gaussians.opacity_logit.sigmoid() >= _SOLID
+    probability = motion["part"].mean(0)
+    if model.config.rigid and model.config.temporal:
+        probability = _found_parts(frame_mean, solid, targets, model.config.parts)
     return GaussianScene(
         mean=_array(gaussians.mean),
         log_scale=_array(gaussians.log_scale),
@@ -65,6 +72,14 @@ def _motion_of_frames(model: Model4D, targets: Targets) -> dict[str, Tensor]:
         rows["control"].append(model.control.position + instant.motion.displacement[0] if sparse else torch.zeros(0, 3))
         rows["turn"].append(instant.motion.quaternion[0] if sparse else torch.zeros(0, 4))
     return {name: torch.stack(values) for name, values in rows.items()}
+
+
+def _found_parts(frame_mean: Tensor, solid: Tensor, targets: Targets, most: int) -> Tensor:  # [N, S]
+    """Returns the parts that the motion of all frames shows, one for each Gaussian."""
+    frames = frame_mean.double().numpy()
+    trusted = trust(frames, solid.numpy(), targets.world_to_camera, targets.intrinsics, targets.size)
+    part = torch.from_numpy(find_parts(frames, trusted, most))
+    return torch.nn.functional.one_hot(part).float()
 
 
 def _part_motion(mean: Tensor, frame_mean: Tensor, probability: Tensor, opacity: Tensor) -> np.ndarray:

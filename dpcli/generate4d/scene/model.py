@@ -31,7 +31,7 @@ class Model4D(nn.Module):
         self.config = config
         self.gaussians = gaussians
         self.field = MotionField(
-            config.parts, config.width, config.depth, config.rigid, config.fusion, config.partition == "time"
+            config.blended_parts, config.width, config.depth, config.rigid, config.fusion, config.partition == "time"
         )
         self.control: ControlPoints | None = None
         self.nearest: Tensor | None = None  # [N, k] control points that move each Gaussian

@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from os.path import splitext
@@ -317,9 +318,10 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
         path
     ):  # frames are many: they are neither sorted nor asked what they are
         for name in folders:
-            if series := frame_series(Path(folder, name), pattern):
-                found.append((Path(folder, name), series))
-                clips.add(os.path.join(folder, name))
+            with suppress(PermissionError):  # it is told as skipped
+                if series := frame_series(Path(folder, name), pattern):
+                    found.append((Path(folder, name), series))
+                    clips.add(os.path.join(folder, name))
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))

@@ -15,7 +15,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode import zip_folders
 from dpcli.prepare.decode.calibration import read_calibration
-from dpcli.prepare.decode.folder_listing import folder_files, leads_out
+from dpcli.prepare.decode.folder_listing import folder_files, is_folder, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
@@ -214,9 +214,9 @@ class NTU60:
         for entry in ordered:
             path = Path(entry.path)
             is_zip = entry.name.lower().endswith(".zip")
-            if entry.is_symlink() and (entry.is_dir() or is_zip):
+            if entry.is_symlink() and (is_folder(entry) or is_zip):
                 yield self._link(path, root)
-            elif entry.is_dir():
+            elif is_folder(entry):
                 if NAME.fullmatch(entry.name):
                     yield video_item(entry.name, path, self.protocol, root=root)
                 else:

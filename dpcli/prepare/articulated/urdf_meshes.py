@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,25 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
         above = list(path.resolve().parents)[1:4]
         folders += [folder for folder in above if root is None or folder.is_relative_to(root.resolve())]
     places = [_joined(path, root, folder, tail) for folder in folders for tail in tails]
+    if not any(place.is_file() for place in places):
+        places += [_joined(path, root, folder, _as_stored(folder, tail)) for folder in folders for tail in tails]
     return next((place for place in places if place.is_file()), places[0])
+
+
+def _as_stored(folder: Path, tail: str) -> str:
+    """Returns the name of a file in the capitals that it has on the disk, which Windows and macOS don't tell apart."""
+    here, parts = folder, tail.split("/")
+    for at, part in enumerate(parts):
+        if (
+            part not in ("", ".", "..")
+            and os.access(here, os.R_OK | os.X_OK)
+            and here.is_dir()
+            and not (here / part).exists()
+        ):
+            alike = [name for name in os.listdir(here) if name.lower() == part.lower()]
+            parts[at] = alike[0] if len(alike) == 1 else part
+        here = here / parts[at]
+    return "/".join(parts)
 
 
 def is_missing(path: Path, name: str, root: Path | None) -> str:

@@ -38,6 +38,7 @@ class ParquetTable:
             raise DataError(
                 f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({' '.join(str(error).split())})"
             ) from None
+        self._table = self._table.flatten()  # a column of structures becomes one for each of their fields
         self.names = tuple(self._table.column_names)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
@@ -50,7 +51,10 @@ class ParquetTable:
                     raise ValueError("times are no numbers")
                 found.append(column.to_numpy().astype(np.float64))
             except (TypeError, ValueError):
-                raise DataError(f"{self.path}: column {self.names[place]!r} holds no numbers") from None
+                kind = "lists" if "list" in str(column.type) else f"no numbers ({column.type})"
+                raise DataError(
+                    f"{self.path}: column {self.names[place]!r} holds {kind}; expected a row for each point"
+                ) from None
         return np.stack(found, axis=1) if found else np.zeros((self._table.num_rows, 0))
 
     def words(self, place: int) -> list[str]:

@@ -35,6 +35,7 @@ _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
 _FRACTION = re.compile(r"[-+]?\d+\.\d+")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
+_SPACED_COMMAS = re.compile(r"[-+]?\d+,\d+(, +[-+]?\d+,\d+)+")
 _POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+")
 _BELOW_THOUSAND = re.compile(r"[-+]?[1-9]\d{0,2}")  # which groups of thousands leave as they are
 _EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
@@ -379,7 +380,8 @@ def _checked_unnamed(table: TextTable) -> TextTable:
     if table.delimiter == "," and not any('"' in line for _, line in rows):
         cells = [cell for _, line in rows for cell in table.cells(line)]
         whole = all(re.fullmatch(r"[-+]?\d+|", cell) for cell in cells)
-        if whole and any(re.fullmatch(r"-0|0\d+", cell) for cell in cells):
+        spaced = all(_SPACED_COMMAS.fullmatch(line) for _, line in rows)
+        if whole and (spaced or any(re.fullmatch(r"-0|0\d+", cell) for cell in cells)):
             raise DataError(
                 f"{table.path}:{rows[0][0]}: decimal commas between commas can't be told apart; save it with"
                 " decimal points, or with semicolons between the columns"

@@ -144,13 +144,28 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml"):
         data = _yaml(path, text)
-    elif suffix == ".txt":
-        lines = (re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines())
-        data = {pair[0]: _number_or_text(pair[1]) for pair in lines if len(pair) == 2}
-    else:
+    elif suffix == ".json" or text.lstrip().startswith(("{", "[{")):
         data = parse_json(text, path)
+    else:
+        data = _of_lines(path, text)
     if not isinstance(data, dict):
         raise DataError(f"{path}: {_EXPECTED}")
+    return data
+
+
+def _of_lines(path: Path, text: str) -> dict[str, Any]:
+    """Returns what lines of ``key = value`` say, or a row of names and one of values. Raises DataError where two lines differ."""
+    lines = [re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines()]
+    pairs = [(pair[0], _number_or_text(pair[1])) for pair in lines if len(pair) == 2]
+    rows = [re.split(r"\s*[,;\t]\s*", line.strip()) for line in text.splitlines() if line.strip()]
+    if not pairs and len(rows) == 2 and len(rows[0]) == len(rows[1]):
+        pairs = [(name, _number_or_text(value)) for name, value in zip(*rows)]
+    data = dict(pairs)
+    twice = next((name for name, value in pairs if data[name] != value), None)
+    if twice:
+        raise DataError(
+            f"{path}: says {twice} twice, with different values; expected the lines of the depth camera alone"
+        )
     return data
 
 
@@ -209,6 +224,9 @@ def _only_numbers(text: str) -> list[float] | None:
 def _of_numbers(path: Path, numbers: list[float]) -> Calibration:
     if len(numbers) == 4:
         return Calibration(_intrinsics(path, numbers, ()), source=str(path))
+    if len(numbers) == 6:  # ARKit's .pincam: the size first
+        size = _pixel_counts(path, *numbers[:2])
+        return Calibration(_intrinsics(path, numbers[2:], ()), *size, source=str(path))
     return Calibration(_intrinsics(path, _of_matrix(path, numbers), ()), source=str(path))
 
 

@@ -16,7 +16,7 @@ from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
 from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
@@ -197,15 +197,14 @@ def _cameras_beside(folder: Path) -> list[str]:
     """
     places = [folder, folder.resolve().parent] if folder.resolve().name.lower() in PICTURE_FOLDERS else [folder]
     beside = [name for name in _CAMERAS if any((place / name).exists() for place in places)]
-    exported = next(
-        (path for path in sorted(folder.glob("*.xmp")) if b"xcr:" in path.read_bytes()), None
-    )  # of RealityCapture
-    return [*beside, exported.name] if exported else beside
+    exported = sorted(folder.glob("*.xmp"))[:1]  # of RealityCapture, one for each image
+    return [*beside, *(path.name for path in exported if b"xcr:" in path.read_bytes())]
 
 
 def read_rgba(path: Path) -> np.ndarray:
     """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
     with _readable(path) as image:
+        require_one_picture(path, image)
         return _to_rgba(as_shown(image), path)
 
 
@@ -232,7 +231,7 @@ def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
         top = gray.max(initial=0)
-        unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        unit = 1 / 255 if image.mode == "F" and top < 2 else 257.0 if top > 255 else 1.0
         if unit == 1 and top and image.mode != "F":
             with log.each_once(_SAID):
                 log.warn(

@@ -70,7 +70,7 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
             if entry.is_file(follow_symlinks=False):  # nearly all; the listing knows it, nothing else is asked
                 continue
             path = Path(entry.path)
-            if not _is_folder(entry):
+            if not is_folder(entry):
                 found += [(path, reason)] if (reason := why_unreadable(path)) else []
                 continue
             if above := _leads_above(entry.path):
@@ -82,8 +82,9 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
     return sorted((path, reason) for path, reason in found if path not in taken)
 
 
-def _is_folder(entry: os.DirEntry[str]) -> bool:
+def is_folder(entry: os.DirEntry[str]) -> bool:
+    """Returns whether an entry is a folder, or a link to one; a link in a circle is none."""
     try:
         return entry.is_dir()
-    except OSError:  # a link in a circle
+    except OSError:
         return False

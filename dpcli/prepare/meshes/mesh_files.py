@@ -95,6 +95,10 @@ def _read_ply(path: Path, root: Path | None) -> Any:
     with path.open("rb") as file:
         _, elements = read_header(path, file)
     faces = sum(element.count for element in elements if element.name == "face")
+    if faces > (size := path.stat().st_size):
+        raise DataError(
+            f"{path}: truncated: its header counts {faces} faces, {size} bytes can't hold them; copy it again"
+        )
     try:
         mesh = _by_trimesh(path, root)
     except Exception:  # such as of triangles and squares together
@@ -109,7 +113,7 @@ def _read_off(path: Path, root: Path | None) -> Any:
 
 
 def _read_dae(path: Path, root: Path | None) -> Any:
-    _require_convex(path)
+    _check_collada(path)
     return _by_trimesh(path, root)
 
 
@@ -173,11 +177,13 @@ def _of_off(vertices: int, rows: list[bytes]) -> Polygons:
     return points, [[int(word) for word in own[1 : 1 + int(own[0])]] for own in words]
 
 
-def _require_convex(path: Path) -> None:
-    """Raises DataError for a COLLADA file that places nothing, or with polygons that aren't convex: its reader cuts fans."""
+def _check_collada(path: Path) -> None:
+    """Raises DataError for a COLLADA file of which its reader would leave something out, or cut polygons that aren't convex."""
     data = path.read_bytes()
-    if b"scene>" not in data:
+    if not re.search(rb"<(\w+:)?scene\b", data):
         raise DataError(f"{path}: it has no scene, so nothing in it is placed; export it again")
+    if b"instance_controller" in data:
+        raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return

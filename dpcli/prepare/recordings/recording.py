@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -46,7 +47,8 @@ class Message:
 def is_recording(path: Path) -> bool:
     """Returns whether a path is a recording: a file of its kind, or the folder of a ROS 2 bag."""
     if path.is_dir():
-        return (path / _METADATA).is_file() and any(one.name.lower().endswith(_IN_FOLDERS) for one in path.iterdir())
+        listed = os.path.isfile(path / _METADATA)  # unlike Path's, it says no of a folder that nobody may enter
+        return listed and any(one.name.lower().endswith(_IN_FOLDERS) for one in path.iterdir())
     return path.suffix.lower() in SUFFIXES
 
 

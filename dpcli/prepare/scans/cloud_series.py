@@ -76,11 +76,13 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[
     return [replace(first, left_out=(*first.left_out, *named)), *others]
 
 
-def refuse_foreign_file(path: Path) -> None:
-    """Raises DataError where a file is of a format that is not read, and says what to do with it."""
+def refuse_file(path: Path, suffixes: Sequence[str]) -> None:
+    """Raises DataError where a path is one file, a cloud or of a format that is not read, and says what to do with it."""
     suffix = path.suffix.lower()
     if suffix in _FOREIGN and path.is_file():
         raise DataError(f"{path}: {suffix} files are not read: {_advice([suffix])}, and name their folder or table")
+    if is_cloud(path.name, suffixes) and path.is_file():
+        raise DataError(f"{path}: one cloud; expected a folder, whose files are the frames of a sequence")
 
 
 def _advice(suffixes: Iterable[str]) -> str:

@@ -17,7 +17,7 @@ from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.prepare.scans.cloud_series import find_sequences, refuse_foreign_file
+from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
 from dpcli.prepare.series import Series, about_series
 from dpcli.store.schema import kept_name
 
@@ -80,7 +80,7 @@ class CloudFolders:
 
     @cached_property
     def _series(self) -> list[Series]:
-        refuse_foreign_file(self.raw)
+        refuse_file(self.raw, SUFFIXES)
         root = require_folder(self.raw, f"point clouds ({', '.join(SUFFIXES)}), or folders of them")
         found = find_sequences(root, SUFFIXES, pattern=self.pattern, table=self.labels)
         if self.label_from_folder and any(one.folder == root for one in found):

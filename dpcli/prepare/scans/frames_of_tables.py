@@ -9,13 +9,16 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_frame_column
 from dpcli.prepare.reader import natural_key
-from dpcli.prepare.scans.times_of_tables import Clock, Table, clock_seconds, seconds_and_parts, seconds_of
+from dpcli.prepare.scans.times_of_tables import SHORTEST, Clock, Table, clock_seconds, seconds_and_parts, seconds_of
+from dpcli.runtime.clips.name_numbers import NumberColumns, parse_name
 
 SINGLE = (
     "sequences whose frames hold one point each; does the frame column tell the time of each point? (--frame-column)"
 )
 FELL = "sequences whose frame numbers fall on the way, put in the order of the numbers (--gap N begins a new sequence there)"
 WRAPPED = "sequences whose frame numbers begin anew at 0 when their counter is full; their frames stay in their order"
+ROUNDED = "sequences whose frame column seems rounded by float32, which makes one frame of several; save it in float64"
+_SPARSE = 2**30
 _EXACT = 2**53  # up to here every whole number is a float64
 _FULL = (2**8, 2**16, 2**32)  # what a counter of 8, 16 or 32 bits never reaches
 JOINED = "frames whose rows were joined, as their numbers come again later (--gap N begins a new sequence there)"
@@ -43,14 +46,20 @@ class Rows:
         since = self.frames - self.frames[0]
         unit = 1.0 if self.clock else seconds_of(column, self.frames)
         if unit:
-            return since * unit
+            return _rising(since * unit)
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
         return since / max(int(step), 1) / fps if fps else None
 
     def times_by(self, clock: Clock) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (T), of a frame's earliest row by a clock; None where they don't rise."""
         starts = np.minimum.reduceat(clock.seconds[self.rows], self.offsets[:-1])
-        return starts - starts[0] if (np.diff(starts) > 0).all() else None
+        return _rising(starts - starts[0])
+
+
+def _rising(seconds: np.ndarray) -> np.ndarray | None:
+    """Returns times of frames that rise, f64 (T), by steps that no sensor falls short of; None of others."""
+    steps = np.diff(seconds)
+    return seconds if not len(steps) or (steps.min() > 0 and np.sort(steps)[len(steps) // 2] >= SHORTEST) else None
 
 
 def frame_column(table: Table, wanted: str) -> str:
@@ -117,8 +126,9 @@ def _values_of_words(table: Table, column: str, words: list[str]) -> tuple[np.nd
         moments = dict(zip(order, seconds))
         told = np.array([moments[word] for word in words])
         return told, told, True
-    if order == sorted(order):
-        order.sort(key=natural_key)
+    names = [parse_name(word) for word in order]
+    if order == sorted(order) and len({name.shape for name in names}) == 1 and len(NumberColumns(names).varying()) == 1:
+        order.sort(key=natural_key)  # one number counts them
     places = {word: k for k, word in enumerate(order)}
     return np.array([places[word] for word in words]), None, False
 
@@ -171,8 +181,15 @@ def _in_frames(name: str, frames: np.ndarray, numbers: np.ndarray | None, rows: 
     values, starts = np.unique(own[order], return_index=True)
     offsets = np.append(starts, len(rows)).astype(np.int64)
     joined = runs - len(values)
+    notes += [ROUNDED] if numbers is not None and _are_rounded(values) else []
     notes += [FELL] if falls and not joined and numbers is not None else []
     return Rows(name, rows[order], offsets, None if numbers is None else values, joined=joined, notes=tuple(notes))
+
+
+def _are_rounded(numbers: np.ndarray) -> bool:
+    """Returns whether large numbers (T) are all such as float32 has, whose neighbors there are 128 or more apart."""
+    with np.errstate(over="ignore"):
+        return bool(len(numbers) and abs(numbers[-1]) >= _SPARSE and (numbers.astype(np.float32) == numbers).all())
 
 
 def _fills_counter(numbers: np.ndarray) -> int:

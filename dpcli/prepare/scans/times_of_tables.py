@@ -25,12 +25,14 @@ _UNITS = (
 _SECONDS = {word: size for size, words in _UNITS for word in words.split()}
 _IN_BRACKETS = {"min": 60.0, "mins": 60.0, "h": 3600.0}  # which mean something else without
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
+SHORTEST = 1e-4  # seconds between frames: what is shorter are days, or times of points
 _LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
 _TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
 _NO_UNITS = _TIME_WORDS | {"gps", "unix", "posix", "local", "sensor", "since", "start"}
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?\s*$")
 _CLOCK = re.compile(
-    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(\d+) days?,? )?(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
+    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(\d+) days?,? )?"  # a date, or a number of days
+    r"(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(?:([AP])\.?M\.?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
 _DAY = 86_400.0
@@ -140,6 +142,8 @@ def clock_seconds(words: Sequence[str]) -> list[float]:
 
     >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["1 days 00:00:01"]), clock_seconds(["a"])
     ([86399.5, 86400.0], [86401.0], [])
+    >>> clock_seconds(["11:59:59 AM", "12:00:01 PM", "1:00:00 PM"])
+    [43199.0, 43201.0, 46800.0]
     """
     found: list[float] = []
     days = 0
@@ -158,11 +162,12 @@ def clock_seconds(words: Sequence[str]) -> list[float]:
 
 
 def _seconds_told(match: re.Match[str]) -> float:
-    year, month, day, days, hour, minute, second, fraction, _ = match.groups()
-    own = int(hour) * 3600 + int(minute) * 60 + int(second) + float((fraction or ".0").replace(",", "."))
+    year, month, day, days, hour, minute, second, fraction, half, zone = match.groups()
+    hours = int(hour) % 12 + 12 * (half in "Pp") if half else int(hour)
+    own = hours * 3600 + int(minute) * 60 + int(second) + float((fraction or ".0").replace(",", "."))
     if year is None:
         return own + int(days or 0) * _DAY
-    return datetime(int(year), int(month), int(day), tzinfo=timezone.utc).timestamp() + own - _offset(match[9])
+    return datetime(int(year), int(month), int(day), tzinfo=timezone.utc).timestamp() + own - _offset(zone)
 
 
 def _offset(zone: str | None) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import open_image, upright
+from dpcli.runtime.clips.images import open_image, require_one_picture, upright
 from dpcli.runtime.progress import log
 
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
@@ -30,6 +30,7 @@ def read_mask(path: Path) -> np.ndarray:
     """
     try:
         with open_image(path) as stored:
+            require_one_picture(path, stored)
             lossy = stored.format in ("JPEG", "AVIF") or stored.format == "WEBP" and not _is_lossless(path)
             image = upright(stored)
             if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
@@ -56,7 +57,8 @@ def _of_palette(path: Path, image) -> np.ndarray:  # image: PIL.Image.Image
     numbers, colors = np.array(image), np.array(image.convert("RGB"))
     used, first = np.unique(numbers, return_index=True)
     shown = colors.reshape(-1, 3)[first].astype(int)
-    if not np.ptp(shown, axis=1).any() and len(np.unique(shown[:, 0])) == len(used):
+    gray = not np.ptp(shown, axis=1).any() and len(np.unique(shown[:, 0])) == len(used)
+    if gray and (shown.min() < _NOISE or len(used) == 1):
         return _of_values(path, colors[..., 0], False)
     black = ~shown.any(1)
     if black.any() and used[0] == 0 and not black[0]:
@@ -103,7 +105,7 @@ def _of_colors(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
 def _of_values(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
     """Returns the mask u8 (H,W) of gray values (H,W) of any type."""
     top = values.max(initial=0)
-    if values.dtype.kind == "f" and top <= 1:
+    if values.dtype.kind == "f" and top < 2:  # up to 1, and a little beyond where a filter overshot
         return np.round(255 * values.clip(0, 1)).astype(np.uint8)
     if lossy and 0 < top < _SMALL_LABEL:
         raise DataError(

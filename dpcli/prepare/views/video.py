@@ -330,6 +330,9 @@ def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...] | Frames:
         raise DataError(
             f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike, with all its objects"
         )
+    if folder.is_dir() and masks.numbers != frames.numbers:
+        pairs = [f"{masks.names[at]} for {frames.names[at]}" for at in (0, -1)]
+        log.info(f"{folder}: its numbers are not those of the frames; masks in order: {pairs[0]} to {pairs[1]}")
     return masks.files if folder.is_dir() else masks
 
 

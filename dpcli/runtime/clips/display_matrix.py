@@ -10,7 +10,9 @@ Matrix = tuple[
     int, int, int, int
 ]  # a, b, c, d: what is stored at (x, y) from the middle is shown at (ax + cy, bx + dy)
 _BESIDE = {1: "side by side", 2: "one above the other", 4: "pixel by pixel", 5: "side by side", 6: "line by line"}
+_BESIDE |= {7: "column by column"}
 _FLAT = 4  # a projection that is none
+_NEWER = 16  # kinds of what stands beside frames that FFmpeg may know and PyAV not
 _KINDS = ("DISPLAYMATRIX", "STEREO3D", "SPHERICAL")
 _TURNED = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))  # by quarters, counterclockwise
 
@@ -39,25 +41,30 @@ def _told_beside(frame) -> dict[str, list[int]] | None:
     import av
 
     try:
-        beside = _without_profile(frame).side_data
+        beside = _readable_beside(frame).side_data
         told = {kind: bytes(one) for kind in _KINDS if (one := beside.get(kind)) is not None}
         return {kind: np.frombuffer(data, "<i4", len(data) // 4).tolist() for kind, data in told.items()}
-    except (ValueError, av.FFmpegError):  # side data that PyAV doesn't know, or pixels that filters don't
+    except (ValueError, av.FFmpegError):  # such as pixels that filters don't know
         return None
 
 
-def _without_profile(frame):  # -> av.VideoFrame
-    """Returns the frame without a color profile, whose name PyAV frees twice, which ends the process."""
+def _readable_beside(frame):  # -> av.VideoFrame
+    """Returns the frame without what PyAV can't read beside it: a color profile, whose name it frees twice, which ends the
+    process, and kinds that are newer than it, such as EXIF.
+    """
     import av
+    from av.sidedata.sidedata import Type
 
     graph = av.filter.Graph()
-    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=Fraction(1, 1000))
-    bare, sink = graph.add("sidedata", "mode=delete:type=ICC_PROFILE"), graph.add("buffersink")
-    source.link_to(bare)
-    bare.link_to(sink)
+    nodes = [graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=Fraction(1, 1000))]
+    for kind in ("ICC_PROFILE", *range(len(Type), len(Type) + _NEWER)):
+        nodes.append(graph.add("sidedata", f"mode=delete:type={kind}"))
+    nodes.append(graph.add("buffersink"))
+    for node, following in zip(nodes, nodes[1:]):
+        node.link_to(following)
     graph.configure()
-    source.push(frame)
-    return sink.pull()
+    nodes[0].push(frame)
+    return nodes[-1].pull()
 
 
 def as_it_plays(picture: np.ndarray, matrix: Matrix) -> np.ndarray:

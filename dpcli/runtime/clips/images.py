@@ -27,6 +27,7 @@ _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds
 _COLORS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # modes of 8 bits
 _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
+_OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
 
 
@@ -56,6 +57,23 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
         yield image
+
+
+def require_one_picture(path: Path, image) -> None:  # image: PIL.Image.Image
+    """Raises DataError for a file of several pictures where one is wanted: an animation, or a TIFF of pages of one size.
+
+    A smaller second page is a preview; the second picture of a JPEG is one for other screens.
+    """
+    if getattr(image, "n_frames", 1) < 2 or image.format not in _OF_SEVERAL:
+        return
+    if image.format == "TIFF":
+        first, _ = image.size, image.seek(1)
+        second, _ = image.size, image.seek(0)
+        if first != second:
+            return
+    raise DataError(
+        f"{path}: {image.n_frames} pictures in one file; an animation is a clip itself, name it; else write each into an image"
+    )
 
 
 def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image

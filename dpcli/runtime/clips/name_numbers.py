@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from decimal import Decimal
 from functools import lru_cache
 from os.path import splitext
@@ -19,6 +19,7 @@ from dpcli.runtime.progress import log
 
 _DATE = re.compile(
     r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
+    r"(?:\+([01]\d):?([0-5]\d)(?!\d))?"  # ahead of Greenwich; behind a minus other numbers may stand
 )
 _YEAR_LAST = re.compile(
     r"([0-3]\d)[-_.]([0-3]\d)[-_.]((?:19|20)\d\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
@@ -26,6 +27,8 @@ _YEAR_LAST = re.compile(
 _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _HALF_DAY = re.compile(r"\d[.:_-]\d\d[ _.-]?[ap]\.?m(?![a-z])", re.IGNORECASE)  # a time before or after noon
+_TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:h])([0-5]\d)\2([0-5]\d)(?!\d)")
+_HALF_A_DAY = 720  # minutes
 _SAID: set[str] = set()
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
@@ -99,9 +102,13 @@ def _since_1970_told_last(match: re.Match[str]) -> str:
     return _since_1970(year, month, day, *clock)
 
 
-def _since_1970(year: str, month: str, day: str, hour: str, minute: str, second: str, fraction: str | None) -> str:
+def _since_1970(
+    year: str, month: str, day: str, hour: str, minute: str, second: str, fraction: str | None, *ahead: str | None
+) -> str:
+    """Returns the seconds of a date, "" where it is none. ahead: hours and minutes by which its zone is."""
+    zone = timezone(timedelta(hours=int(ahead[0] or 0), minutes=int(ahead[1] or 0)) if ahead else timedelta())
     try:
-        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=timezone.utc)
+        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=zone)
     except ValueError:  # such as month 13: it is no date
         return ""
     return f"{int(moment.timestamp()) + int(second)}" + (f".{fraction}" if fraction else "")
@@ -199,12 +206,22 @@ def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
         why = f"whether day or month stands first in {dates[0][0]} and the like"
     elif len(names) > 1 and any(map(_HALF_DAY.search, names)):
         why = "when it was by clocks of 12 hours"
+    elif _may_pass_midnight(names):
+        why = "whether these times of day go on past midnight"
     if why:
         with log.each_once(_SAID):
             log.warn(
                 f"{folder}: {why} can't be told from the names; the numbers order them as they stand. Names such as"
                 " 2024-03-05_14-30-00 tell it"
             )
+
+
+def _may_pass_midnight(names: Sequence[str]) -> bool:
+    """Returns whether names hold times of day without a date, and none from between late and early: more than half a day."""
+    clocks = [match for name in names if (match := _TIME_OF_DAY.search(name)) and not _DATE.search(name)]
+    minutes = sorted({int(match[1]) * 60 + int(match[3]) for match in clocks})
+    apart = [b - a for a, b in zip(minutes, minutes[1:])]
+    return len(clocks) == len(names) > 1 and max(apart, default=0) > _HALF_A_DAY
 
 
 def _counts_after_point(column: Sequence[str]) -> bool:

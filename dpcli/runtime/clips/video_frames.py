@@ -92,11 +92,11 @@ def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) 
 def _look(path: Path, changed: int, size: int) -> VideoLook:
     container, stream = _open(path)
     with closing(container):
-        stamps, first, failed, alpha, seen = [], None, False, False, False
+        stamps, first, failed, alpha, seen, woven = [], None, False, False, False, 0
         bare = container.format.name in _BARE
         try:
             for frame in _decoded(path, container, stream):
-                first = first or frame
+                first, woven = first or frame, woven + bool(frame.interlaced_frame)
                 if _has_alpha(frame) and not (alpha and seen):
                     low, high = _ends_of_alpha(frame)
                     alpha, seen = alpha or low < 255, seen or high > 0
@@ -117,6 +117,9 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         _require_one_layer(path, stream)
         _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
+        if woven:  # of a film on television some are, two of five
+            part = "" if woven == len(stamps) else f" in {woven} of {len(stamps)} frames"
+            log.warn(f"{path}: interlaced{part}: each shows two moments, line by line; ffmpeg -vf bwdif parts them")
         left, right, top, bottom = _margins(path, container, stream)
         if left + right + top + bottom:
             shown = f"{first.width - left - right}x{first.height - top - bottom} of {first.width}x{first.height}"
@@ -362,8 +365,6 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.warn(
             f"{path}: {more}, as the file says; all of each frame is read as one picture: cut out a plain one first"
         )
-    if frame.interlaced_frame:
-        log.warn(f"{path}: interlaced: each frame shows two moments, line by line; ffmpeg -vf bwdif parts them")
     if int(frame.color_trc) in _HDR:
         log.warn(
             f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): tone-mapped to SDR as ITU-R BT.2390 has it; players "

@@ -23,7 +23,7 @@ from dpcli.runtime.settings import value_types as kinds
 
 LARGEST = 1e30  # of any number: float32 ends soon after
 WIDEST = 4096  # channels of a layer, by far: published networks for points have up to 1024
-_LARGEST_INT = 10**6  # of a whole number without a bound of its own: no count or size here is larger
+_LARGEST_INT = 10**7  # of a whole number without a bound of its own: no count or size here is larger
 _SHOWN = 60  # letters of a value in a message
 
 

@@ -53,7 +53,7 @@ def model(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "all")])
+@pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "head"), (21, "all")])
 def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
     with CloudsReader(clouds(tmp_path / "c.h5", videos)) as reader:
         assert part_for(reader) == part
@@ -70,7 +70,10 @@ def test_where_everything_learns_it_is_at_the_rate_of_a_training_from_nothing(vi
     schedule = _schedule(quick, "all", videos)
     assert schedule.stage_epochs == epochs and schedule.learning_rate == quick.learning_rate
     assert _schedule(quick, "head", videos).stage_epochs == (max(5, min(100, 5000 // videos)),) * 2
-    assert _schedule(PRESETS["sparse"]["schedule"], "all", videos).epochs_dynamic == 0
+    assert _schedule(quick, "head", videos).learning_rate == _schedule(quick, "probe", videos).learning_rate == 6e-3
+    sparse = PRESETS["sparse"]["schedule"]
+    assert _schedule(sparse, "all", videos).epochs_dynamic == 0
+    assert _schedule(sparse, "head", videos).learning_rate == sparse.learning_rate
 
 
 @pytest.mark.parametrize("points, told", [(1, 0), (3, 0), (80, 1)])

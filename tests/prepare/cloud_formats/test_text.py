@@ -108,6 +108,7 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
     [
         ("x,y,z\n0,126,-0,132,0,640\n", "a.csv:2: 6 values; .*decimal commas between commas"),
         ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
+        ("1,5, 2,25, 3,5\n4,5, 5,25, 6,5\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
         ("x;y;z\n1.500;2;3\n500;2;3\n", "1.500 beside 500 may be 1500 or 1.500"),

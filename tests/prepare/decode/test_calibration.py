@@ -73,6 +73,9 @@ FORMS = [
     ("k.json", PLAIN, (0, 0)),
     ("k.json", {"intrinsic_matrix": COLUMNS, "width": 640, "height": 480}, (640, 480)),
     ("k.json", {"intrinsic_matrix": ROWS}, (0, 0)),
+    ("a.pincam", f"640 480 {FX} {FY} {CX} {CY}\n", (640, 480)),
+    ("k.toml", f"fx = {FX}\nfy = {FY}\ncx = {CX}\ncy = {CY}\nwidth = 640\nheight = 480\n", (640, 480)),
+    ("k.csv", f"fx,fy,cx,cy\n{FX},{FY},{CX},{CY}\n", (0, 0)),
     ("k.json", {"camera_matrix": NESTED, "dist_coeffs": [[0, 0, 0, 0, 0]]}, (0, 0)),
     ("k.json", {"K": COLUMNS, "w": 640, "h": 480}, (640, 480)),
     ("k.json", REALSENSE, (640, 480)),
@@ -227,6 +230,7 @@ def test_a_lens_is_straightened(tmp_path):
         ("cameras.txt", "1 OPENCV_FISHEYE 640 480 1 2 3 4 5 6 7 8\n", "camera model OPENCV_FISHEYE"),
         ("cameras.txt", COLMAP + "2 PINHOLE 640 480 1 2 3 4\n", "holds 2 different cameras"),
         ("k.yaml", "a: [1,", "is not YAML"),
+        ("k.ini", "[vga]\nfx=1\nfy=1\ncx=1\ncy=1\n[hd]\nfx=2\nfy=2\ncx=2\ncy=2\n", "says fx twice, with different"),
         (
             "k.yaml",
             "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9 if n else ['1'] * 9)}]\n" for n in range(9)),

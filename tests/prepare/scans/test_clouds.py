@@ -172,7 +172,7 @@ def test_truncated_files_are_named(tmp_path, suffix):
     path = save(tmp_path / f"0{suffix}")
     whole = path.read_bytes()
     path.write_bytes(whole[:-7])
-    with pytest.raises(DataError, match=f"0{suffix}: .*(truncated|not a readable)"):
+    with pytest.raises(DataError, match=f"0{suffix}: .*(truncated|not a readable|damaged)"):
         read_cloud(path)
     path.write_bytes(b"")
     with pytest.raises(DataError, match=f"0{suffix}: the file is empty"):
@@ -252,6 +252,9 @@ def test_what_else_lies_there_is_named(tmp_path):
     (tmp_path / "a.xlsx").write_bytes(b"PK")
     with pytest.raises(DataError, match="a.xlsx: .xlsx files are not read: save their sheets as .csv"):
         CloudFolders(tmp_path / "a.xlsx").items()
+    save(tmp_path / "b.ply")
+    with pytest.raises(DataError, match="b.ply: one cloud; expected a folder"):
+        CloudFolders(tmp_path / "b.ply").items()
 
 
 @pytest.mark.parametrize("name", ["0.ply", "0.pcd", "0.las", "0.npy", "0.bin", "0.csv", "0.npz"])

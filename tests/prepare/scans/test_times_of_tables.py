@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dpcli.prepare.scans.frames_of_tables import ROUNDED
 from dpcli.prepare.scans.tables import TableSequences
 
 RNG = np.random.default_rng(0)
@@ -37,6 +38,8 @@ def csv(path, header, rows):
         ("timestamp", [1_234_567_890, 1_234_617_890], None),  # microseconds since the sensor began
         ("timestamp", [1_700_000_000, 1_700_000_030], [0, 30]),
         ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
+        ("time", ["11:59:59 AM", "12:00:00.5 pm"], [0, 1.5]),
+        ("time", [45356.5, 45356.500001157], None),  # days, as spreadsheets count them
         ("time", ["1 day, 0:00:01", "2 days, 0:00:01"], [0, 86400]),
     ],
 )
@@ -74,6 +77,9 @@ def test_names_of_frames_in_the_order_of_the_alphabet_are_put_in_that_of_their_n
     logged = [f"frame_{k}.pcd" for k in (8, 9, 10, 1)]
     path = csv(tmp_path / "b.csv", "frame,x,y,z", [(name, int(name[6:-4]), 1, 2) for name in logged])
     assert only_sequence(path)[0].points[:, 0].tolist() == [8, 9, 10, 1]
+    clocks = ["11:59:59:07", "12:00:01:02", "1:00:00:01"]  # in the alphabet's order by chance
+    path = csv(tmp_path / "d.csv", "frame,x,y,z", [(clock, k, 1, 2) for k, clock in enumerate(clocks)])
+    assert only_sequence(path)[0].points[:, 0].tolist() == [0, 1, 2]
     csv(tmp_path / "c.csv", "frame,x,y,z", [("a", 1, 1, 1), ("", 1, 1, 1)])
     (item,) = TableSequences(tmp_path / "c.csv").items()
     assert "1 rows, the first is 2, have no number in 'frame'" in item.problem
@@ -85,6 +91,13 @@ def test_numbers_that_no_float_holds_stay_apart(tmp_path, first):
     sequence, _ = only_sequence(csv(tmp_path / "a.csv", "frame,x,y,z", rows), fps=10)
     assert sequence.num_frames == 4
     np.testing.assert_allclose(sequence.time, [0, 0.1, 0.2, 0.3])
+
+
+def test_times_that_float32_rounded_are_told(tmp_path):
+    for moments, told in (([1_709_640_064] * 2, True), ([1_709_640_000, 1_709_640_001], False), ([128, 256], False)):
+        csv(tmp_path / "a.csv", "time,x,y,z", [(moment, 1, 2, k) for k, moment in enumerate(moments)])
+        reader = TableSequences(tmp_path / "a.csv", frame_column="time")
+        assert (ROUNDED in reader.read(reader.items()[0], RNG).notes) == told
 
 
 def test_numbers_of_frames_in_groups_of_thousands(tmp_path):
@@ -112,3 +125,16 @@ def test_types_of_times_are_times_whatever_their_columns_are_called(tmp_path, ki
     assert sequence.time is None if kind == "int64" else sequence.time.tolist() == [0, 2]
     (item,) = TableSequences(tmp_path / "a.parquet", frame_column="recorded", sequence_column="run").items()
     assert "a row has nothing in its column 'run'" in item.problem
+
+
+def test_structures_are_columns_and_lists_are_named(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    places = [{"x": float(k), "y": 1.0, "z": 2.0} for k in range(3)]
+    parquet.write_table(pyarrow.table({"frame": [0, 0, 1], "position": places}), tmp_path / "a.parquet")
+    assert only_sequence(tmp_path / "a.parquet")[0].points[:, 0].tolist() == [0, 1, 2]
+    lists = {name: [[1.0, 2.0], [3.0]] for name in "xyz"}
+    parquet.write_table(pyarrow.table({"frame": [0, 1], **lists}), tmp_path / "b.parquet")
+    (item,) = TableSequences(tmp_path / "b.parquet").items()
+    assert "column 'x' holds lists; expected a row for each point" in item.problem

@@ -265,6 +265,18 @@ def write_masks(path: Path, masks: list[np.ndarray]) -> Path:
     return path
 
 
+@pytest.mark.parametrize(("start", "said"), [(0, ""), (1, "masks in order: 1.png for 0.png to 3.png for 2.png")])
+def test_masks_of_other_numbers_are_taken_in_order_and_told(tmp_path, capfd, start, said):
+    """As trackers count frames from 0, and programs that write frames from 1."""
+    discs = moving(3)
+    folder = save(tmp_path / "clip", [on(picture) for picture in discs], "{}.png")
+    for number, picture in enumerate(discs, start):
+        save(tmp_path / "masks", [picture[..., 3]], f"{number}.png")
+    assert len(read(video_clip(folder, VideoOptions(size=32, mask=tmp_path / "masks")))) == 3
+    error = capfd.readouterr().err
+    assert (said in error) if said else "in order" not in error
+
+
 def test_masks_cut_a_busy_background(tmp_path):
     rng = np.random.default_rng(0)
     busy = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(3)]

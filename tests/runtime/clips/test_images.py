@@ -13,6 +13,7 @@ from PIL import Image
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.name_numbers import in_order
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -34,6 +35,10 @@ def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
     exif[0x0112] = orientation
     turned.save(tmp_path / "0.png", exif=exif)
     np.testing.assert_array_equal(read_rgba(tmp_path / "0.png")[..., :3], rgb)
+    for kind in ("png", "webp"):  # FFmpeg decodes the one, and turns it, Pillow the other
+        other = Image.new("RGB", turned.size)
+        turned.save(tmp_path / f"moving.{kind}", exif=exif, save_all=True, append_images=[other], lossless=True)
+        np.testing.assert_array_equal(next(open_frames(tmp_path / f"moving.{kind}").read([0]))[..., :3], rgb)
 
 
 def shown(rgb: np.ndarray, primaries, gamma: float) -> np.ndarray:
@@ -197,9 +202,33 @@ def test_pages_of_a_tiff_are_no_clip(tmp_path):
         (["13-02-2024 10.00.00.png", "14-01-2024 10.00.00.png"], ""),
         (["shot 12.00.00 PM.png", "shot 1.00.00 PM.png"], "clocks of 12 hours"),
         (["cam 1pma.png", "cam 2pma.png"], ""),
+        (["a 23-59-59.png", "a 00-00-01.png"], "whether these times of day go on past midnight"),
+        (["a 13-59-59.png", "a 14-00-01.png"], ""),
+        (["2024-02-13 23.59.59.png", "2024-02-14 00.00.01.png"], ""),
     ],
 )
 def test_names_that_may_mean_two_times_are_told(names, words, tmp_path, capfd):
     in_order([tmp_path / name for name in names])
     told = capfd.readouterr().err
     assert words in told if words else not told
+
+
+@pytest.mark.parametrize("kind", ["webp", "png", "tif", "preview.tif"])
+def test_files_of_several_pictures_are_no_frames(tmp_path, kind):
+    """A folder of stickers is no clip of their first pictures; a TIFF may hold a smaller one of itself."""
+    pictures = [Image.new("RGB", (40, 30), (9 * k, 0, 0)) for k in range(3)]
+    pictures = [pictures[0], pictures[0].resize((20, 15))] if kind == "preview.tif" else pictures
+    for number in range(2):
+        pictures[0].save(tmp_path / f"{number}.{kind}", save_all=True, append_images=pictures[1:])
+    for read in (
+        lambda: next(open_frames(tmp_path).read([0])),
+        lambda: read_mask(tmp_path / f"0.{kind}"),
+        lambda: FolderSource(tmp_path),
+    ):
+        if kind == "preview.tif":
+            read()
+            continue
+        with pytest.raises(
+            DataError, match=f"0.{kind}: 3 pictures in one file; an animation is a clip itself, name it"
+        ):
+            read()

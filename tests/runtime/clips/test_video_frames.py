@@ -306,10 +306,15 @@ def test_colors_that_are_not_converted_are_refused(pictures, tmp_path):
         look_at_video(film(pictures, tmp_path / "c.mp4", *PLAIN, *tag))
 
 
-def test_interlaced_lines_are_told(pictures, tmp_path, capfd):
+def test_interlaced_lines_are_told_in_some_frames_as_in_all(pictures, tmp_path, capfd):
     words = ("-c:v", "mpeg2video", "-r", 25, "-vf", "setfield=tff,interlace", "-flags", "+ilme+ildct")
-    look_at_video(film(pictures, tmp_path / "i.ts", *words))
-    assert "interlaced: each frame shows two moments" in capfd.readouterr().err
+    woven = film(pictures, tmp_path / "i.ts", *words)
+    count = look_at_video(woven).count
+    assert "i.ts: interlaced: each shows two moments" in capfd.readouterr().err
+    plain = film(pictures, tmp_path / "p.ts", "-c:v", "mpeg2video", "-r", 25)
+    (tmp_path / "both.ts").write_bytes(plain.read_bytes() + woven.read_bytes())
+    whole = look_at_video(tmp_path / "both.ts").count
+    assert f"both.ts: interlaced in {count} of {whole} frames: each shows" in capfd.readouterr().err
 
 
 def test_an_hdr_clip_is_named(pictures, tmp_path, capfd):
@@ -457,6 +462,7 @@ BLACK, WHITE, RED, GREEN = (0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 200, 0)
         pytest.param(with_palette(LABELS == 0, WHITE, BLACK), id="white is number 0"),
         pytest.param(with_palette(np.choose(LABELS, [1, 0, 2]), RED, BLACK, GREEN), id="black is number 1"),
         pytest.param(with_palette(LABELS, WHITE, RED, GREEN), id="on white paper"),
+        pytest.param(with_palette(LABELS, (128, 128, 128), WHITE, (200, 200, 200)), id="on gray paper"),
         pytest.param(with_palette(LABELS, BLACK, BLACK, BLACK), id="without colors"),
         pytest.param(with_palette(LABELS * 0, WHITE), id="white alone"),
         pytest.param(colors_of(RED, GREEN).quantize(4), id="made smaller"),
@@ -491,7 +497,7 @@ def test_masks_that_cannot_be_told_are_refused(tmp_path, values, name, message):
         read_mask(tmp_path / name)
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency", "palette"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "overshot", "alpha", "transparency", "palette"])
 def test_a_soft_mask_stays_soft(tmp_path, kind):
     y, x = np.mgrid[:48, :64]
     soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
@@ -500,11 +506,14 @@ def test_a_soft_mask_stays_soft(tmp_path, kind):
         "8 bits": Image.fromarray(soft),
         "16 bits": Image.fromarray(soft.astype(np.uint16) * 257),
         "floats": Image.fromarray(soft.astype(np.float32) / 255),
+        "overshot": Image.fromarray(
+            np.where(soft == 255, 1.04, np.where(soft == 0, -0.02, soft / 255)).astype(np.float32)
+        ),
         "alpha": Image.fromarray(np.stack([soft * 0, soft], -1)),
         "transparency": Image.fromarray(soft).convert("P"),
         "palette": Image.fromarray(soft).convert("RGB").quantize(256),
     }[kind]
-    name, words = ("m.tif", {}) if kind == "floats" else ("m.png", {})
+    name, words = ("m.tif", {}) if kind in ("floats", "overshot") else ("m.png", {})
     words = {"transparency": bytes(range(256))} if kind == "transparency" else words
     image.save(tmp_path / name, **words)
     np.testing.assert_array_equal(read_mask(tmp_path / name), soft)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
+from xml.etree import ElementTree
 
+import h5py
 import numpy as np
 import pytest
 
@@ -89,10 +92,16 @@ def test_joints_flow_through_a_pipe(truth, parts, dpc):
 
 
 def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
-    done = dpc_here("segment", "joints", parts, "-o", tmp_path / "robots")
+    """A name with letters that XML has no place for makes a robot that can be read, too."""
+    odd = tmp_path / "odd.h5"
+    shutil.copyfile(parts, odd)
+    with h5py.File(odd, "r+") as file:
+        names = [name.decode() for name in file["name"][:]]
+        file["name"][0] = names[0] + "\x1b[31m\n"
+    done = dpc_here("segment", "joints", odd, "-o", tmp_path / "robots")
     assert done.returncode == 0, done.stderr
-    with PartsReader(parts) as reader:
-        assert {path.stem for path in (tmp_path / "robots").glob("*.urdf")} == set(reader.names)
+    found = {path.stem: ElementTree.parse(path).getroot().get("name") for path in (tmp_path / "robots").glob("*.urdf")}
+    assert set(names[1:]) < set(found) and names[0] + "\\x1b[31m\\n" in found.values() and len(found) == len(names)
 
 
 def test_a_folder_that_could_not_be_filled_is_not_left(parts, tmp_path, monkeypatch):

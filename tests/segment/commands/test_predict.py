@@ -62,7 +62,7 @@ def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, mo
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (("predict", "DATA", "-o", "OUT", "--model", "nowhere"), 2, b"no such file"),
+        (("predict", "DATA", "-o", "OUT", "--model", "nowhere"), 3, b"no such file"),
         (("predict", "DATA", "-o", "OUT", "--method", "kmeans"), 2, b"dbscan, ward, ssc, trajaffn"),
         (("predict", "DATA", "-o", "OUT", "--parts", "3"), 2, b"parts belongs to --method"),
         (("predict", "DATA", "-o", "OUT", "--fast", "--method", "ward"), 2, b"it means --method network"),

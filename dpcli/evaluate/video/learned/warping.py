@@ -13,7 +13,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.video.frechet.frame_inputs import check_picture_values
 from dpcli.evaluate.video.learned.base import FrameGap, LearnedMetric, LearnedScore
-from dpcli.evaluate.video.learned.optical_flow import optical_flow, seen_in_both, warped
+from dpcli.ops.optical_flow import optical_flow, seen_in_both, warped
 
 SMALLEST = 16  # pixels a side
 

@@ -14,7 +14,7 @@ from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
 from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
@@ -74,6 +74,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
     """Returns rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit color."""
     try:
         with open_image(path) as image:
+            require_one_picture(path, image)
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = not {"A", "a"}.isdisjoint(image.getbands()) or "transparency" in image.info

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.learned.optical_flow import optical_flow, seen_in_both, warped
 from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute, warping_merge
+from dpcli.ops.optical_flow import optical_flow, seen_in_both, warped
 from dpcli.runtime.seeds import generator
 
 FRAMES, SIDE = 6, 96
