@@ -7,6 +7,7 @@ only Gaussians that a camera sees: what hides behind them moves as the network h
 from __future__ import annotations
 
 import heapq
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,7 +108,9 @@ def _patches(own: np.ndarray) -> np.ndarray:  # [T, M, 3] -> [M]
     travel = few - few.mean(0)
     feature = np.concatenate([own[0], *(_TRAVEL / len(few) ** 0.5 * travel)], 1)
     start = feature[fps_numpy(own[0], min(_PATCHES, len(feature) // _NEIGHBORS))]
-    label = kmeans2(feature, start, iter=10, minit="matrix")[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a patch that lost all its points isn't missed
+        label = kmeans2(feature, start, iter=10, minit="matrix")[1]
     return np.unique(label, return_inverse=True)[1]
 
 

@@ -16,6 +16,7 @@ from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.segmenters import Flows, Segmenter
 
 _TEMPERATURE = 0.2  # of masks, in costs of a point
+_LEAST_TRUST = 0.01  # of a body that some frame doesn't show: above 0, since the likeliest body of a mask is the part
 Motions = dict[tuple[int, int], tuple[Tensor, Tensor]]  # (t, u) -> motions (S,3,3), (S,3) of all parts
 
 
@@ -73,7 +74,7 @@ def masks_of(found: Explanation, sizes: list[int], slots: int) -> np.ndarray:
     label = likely.argmax(1)
     frames = np.split(label, np.cumsum(sizes)[:-1])
     shares = np.stack([np.bincount(own, minlength=len(found.bodies)) / max(len(own), 1) for own in frames])
-    trust = (shares.min(0) / np.maximum(shares.max(0), 1e-9))[label, None]
+    trust = np.maximum(shares.min(0) / np.maximum(shares.max(0), 1e-9), _LEAST_TRUST)[label, None]
     masks = np.repeat((1 - trust) / slots, slots, axis=1)
     masks[:, : len(found.bodies)] += trust * likely
     return masks.astype(np.float32)

@@ -213,3 +213,10 @@ def test_masks_are_shares_and_trust_a_body_that_every_frame_holds():
         2 / 3 * 1 / (1 + np.exp(-2)) + 1 / 15, rel=1e-5
     )  # two, then three of four points
     assert masks[2, 1] < masks[0, 0]
+
+
+def test_a_body_that_some_frame_does_not_show_keeps_its_points_in_the_others():
+    label = np.array([0, 0, 1, 1, 0, 0, 0, 0])  # of two frames of 4 points
+    field = np.float32(np.where(np.eye(2)[label] > 0, 0.0, 0.4))
+    masks = masks_of(Explanation([None, None], label, field, 0.0, field, field), [4, 4], 5)
+    assert (masks.argmax(1) == label).all() and np.allclose(masks.sum(1), 1)
