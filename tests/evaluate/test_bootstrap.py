@@ -311,7 +311,7 @@ def files(tmp_path_factory):
 
 
 def run(*arguments: object):
-    result = CliRunner().invoke(evaluate.app, [str(a) for a in arguments])
+    result = CliRunner().invoke(evaluate.ROOM.application(), [str(a) for a in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.stdout

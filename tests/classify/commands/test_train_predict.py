@@ -419,7 +419,7 @@ def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc_here, t
     kind = dpc_here("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert kind.returncode == 3 and b"holds 'scores'" in kind.stderr and not (tmp_path / "s.h5").exists()
     none = dpc_here("classify", "predict", data, "--model", "nowhere", "-o", tmp_path / "s.h5")
-    assert none.returncode == 2 and b"nowhere" in none.stderr
+    assert none.returncode == 3 and b"nowhere" in none.stderr
 
 
 def test_truncated_and_foreign_weights_are_refused(data, run_folder, dpc_here, tmp_path):

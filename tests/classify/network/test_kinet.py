@@ -263,7 +263,7 @@ def test_shipped_models_load_and_have_a_card():
         with torch.no_grad():
             static, dynamic = model(body_like_clip(model.config.num_frames, model.config.points_per_frame))
         assert torch.isfinite(static).all() and torch.isfinite(dynamic).all()
-    with pytest.raises(UsageError, match=names[0]):
+    with pytest.raises(DataError, match=names[0]):
         load_model("nonesuch")
 
 

@@ -52,7 +52,7 @@ def write_truth(path: Path, labels: dict[str, int], names: tuple[str, ...] = NAM
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(evaluate.app, ["classification", *(str(a) for a in arguments)])
+    return CliRunner().invoke(evaluate.ROOM.application(), ["classification", *(str(a) for a in arguments)])
 
 
 def test_json_by_hand(scores: Path) -> None:

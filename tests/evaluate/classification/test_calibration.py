@@ -76,7 +76,7 @@ def test_the_command_tells_it_in_every_form(tmp_path, probabilities):
             writer.write(f"v{i}", row if probabilities else 7 * row, label=int(label), split="test")
 
     def run(*words):
-        return CliRunner().invoke(evaluate.app, ["classification", str(path), *words])
+        return CliRunner().invoke(evaluate.ROOM.application(), ["classification", str(path), *words])
 
     found = json.loads(run("--json").stdout)
     text = run("--picture", str(tmp_path / "p.png"), "--resamples", "200").stdout

@@ -39,12 +39,15 @@ def test_another_length_unit_is_an_error(task, parts, tmp_path):
     truth = write_truth(
         tmp_path / "mm.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit="mm"
     )
-    result = CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(truth)])
+    result = CliRunner().invoke(evaluate.ROOM.application(), [task, str(parts["good"]), "--truth", str(truth)])
     assert isinstance(result.exception, DataError) and "length_unit 'm', but 'mm' in" in str(result.exception)
     unnamed = write_truth(
         tmp_path / "none.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit=""
     )
-    assert CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(unnamed)]).exit_code == 0
+    assert (
+        CliRunner().invoke(evaluate.ROOM.application(), [task, str(parts["good"]), "--truth", str(unnamed)]).exit_code
+        == 0
+    )
 
 
 def damaged(source: Path, target: Path, change) -> Path:
@@ -107,7 +110,7 @@ def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words
     bad = damaged(source, tmp_path / "bad.h5", change)
     task = "classification" if what == "scores" else "motion"
     given = {"scores": [bad], "parts": [bad, "--truth", parts["truth"]], "truth": [parts["good"], "--truth", bad]}[what]
-    result = CliRunner().invoke(evaluate.app, [task, *map(str, given)])
+    result = CliRunner().invoke(evaluate.ROOM.application(), [task, *map(str, given)])
     assert isinstance(result.exception, DataError), result.exception
     calls = [str(result.exception)]
     for command in (["compare", given[0], *given], ["runs", *given]):

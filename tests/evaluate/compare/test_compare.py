@@ -55,7 +55,8 @@ def test_numbers_are_those_of_the_single_commands(run, parts, scores):
     for task in ("segmentation", "motion"):
         for side, name in (("a", "good"), ("b", "twin")):
             result = CliRunner().invoke(
-                evaluate.app, [task, str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"]
+                evaluate.ROOM.application(),
+                [task, str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
             )
             for key, value in json.loads(result.stdout)["metrics"].items():
                 if key in found:

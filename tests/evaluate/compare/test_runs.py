@@ -56,7 +56,7 @@ def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):
     lines = [
         CliRunner()
         .invoke(
-            evaluate.app,
+            evaluate.ROOM.application(),
             ["segmentation", str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
         )
         .stdout
@@ -86,7 +86,7 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         objects[protocol] = (
             CliRunner()
             .invoke(
-                evaluate.app,
+                evaluate.ROOM.application(),
                 ["segmentation", str(parts["good"]), "--truth", str(parts["truth"]), "--json", "--protocol", protocol],
             )
             .stdout

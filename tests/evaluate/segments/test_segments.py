@@ -98,7 +98,7 @@ def table(path, rows: str) -> str:
 
 
 def run(*words: str):
-    return CliRunner().invoke(evaluate.app, ["segments", *words])
+    return CliRunner().invoke(evaluate.ROOM.application(), ["segments", *words])
 
 
 def test_the_command_compares_tables_in_any_form_and_order(tmp_path):

@@ -24,7 +24,7 @@ from tests.support.video_clips import FRAMES, HEIGHT, ROLES, WIDTH, clip, header
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(evaluate.app, ["video", *(str(a) for a in arguments)])
+    return CliRunner().invoke(evaluate.ROOM.application(), ["video", *(str(a) for a in arguments)])
 
 
 def numbers(report: VideoReport, name: str) -> list[float]:
@@ -225,13 +225,15 @@ def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> N
 def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path: Path) -> None:
     worse = write(tmp_path / "worse.h5", clip(2, noise=12))
     command = ["compare", str(said), str(worse), "--truth", str(truth), "--metrics", "psnr,ssim", "--json"]
-    found = json.loads(CliRunner().invoke(evaluate.app, command).stdout)
+    found = json.loads(CliRunner().invoke(evaluate.ROOM.application(), command).stdout)
     expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
     change = found["metrics"]["psnr"]
     assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
     with pytest.raises(UsageError, match="a video holds no truth"):
-        raise CliRunner().invoke(evaluate.app, ["compare", str(said), str(worse)]).exception
-    runs = CliRunner().invoke(evaluate.app, ["runs", str(said), str(worse), "--truth", str(truth), "--json"])
+        raise CliRunner().invoke(evaluate.ROOM.application(), ["compare", str(said), str(worse)]).exception
+    runs = CliRunner().invoke(
+        evaluate.ROOM.application(), ["runs", str(said), str(worse), "--truth", str(truth), "--json"]
+    )
     assert json.loads(runs.stdout)["metrics"]["psnr"]["mean"] == pytest.approx(np.mean(expected))
 
 

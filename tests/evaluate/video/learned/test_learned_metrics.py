@@ -138,7 +138,7 @@ def test_warping_is_one_number_in_video_compare_and_runs(tmp_path: Path) -> None
 
     def run(*arguments: object) -> dict:
         given = [*map(str, arguments), "--truth", str(truth), "--metrics", "warping", "--json"]
-        return json.loads(CliRunner().invoke(evaluate.app, given, catch_exceptions=False).stdout)
+        return json.loads(CliRunner().invoke(evaluate.ROOM.application(), given, catch_exceptions=False).stdout)
 
     alone = [run("video", path)["metrics"]["warping"] for path in (said, other)]
     found = run("video", said)
@@ -150,7 +150,9 @@ def test_warping_is_one_number_in_video_compare_and_runs(tmp_path: Path) -> None
     assert [compared["a"], compared["b"]] == pytest.approx(alone)
     assert run("runs", said, other)["metrics"]["warping"]["mean"] == pytest.approx(np.mean(alone))
     (tmp_path / "video.json").write_text(json.dumps(found))
-    told = CliRunner().invoke(evaluate.app, ["runs", str(tmp_path / "video.json"), "--json"], catch_exceptions=False)
+    told = CliRunner().invoke(
+        evaluate.ROOM.application(), ["runs", str(tmp_path / "video.json"), "--json"], catch_exceptions=False
+    )
     assert json.loads(told.stdout)["metrics"]["warping"]["mean"] == pytest.approx(alone[0])
 
 
@@ -238,7 +240,7 @@ def test_equal_videos_score_perfectly(files, fake_networks) -> None:
 def test_absent_weights_cost_only_their_own_metric(files, no_weights: Path) -> None:
     said, truth = map(str, files)
     command = ["video", said, "--truth", truth, "--metrics", "psnr,lpips,fvd,warping", "--protocol", "thesis", "--json"]
-    result = CliRunner().invoke(evaluate.app, command)
+    result = CliRunner().invoke(evaluate.ROOM.application(), command)
     assert isinstance(result.exception, DataError)
     message = str(result.exception)
     assert message.startswith("lpips not computed (fvd neither): ") and "\n" not in message
