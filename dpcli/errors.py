@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,14 +45,15 @@ class Stopped(DpcError):
 def reading(where: object) -> Iterator[None]:
     """Turns whatever a library raises in the block into DataError that names `where`, the file or sample, and its type.
 
-    Our own errors pass, as do those of the system that carry a number (no such file, no permission, no room).
+    Our own errors pass, as do those of the system that carry a number (no such file, no permission, no room), but not that
+    of a place that no file has, to which damaged offsets lead.
     """
     try:
         yield
     except DpcError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno is not None:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL, errno.EOVERFLOW):
             raise
         said = (str(error).splitlines() or [""])[0][:200]
         what = f"{type(error).__name__}: {said}" if said else type(error).__name__

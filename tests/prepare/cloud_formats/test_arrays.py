@@ -177,3 +177,13 @@ def test_damaged_arrays_are_named(tmp_path):
         archive.writestr("points", b"no array")
     with pytest.raises(DataError, match="expected one called points"):
         read_npz(tmp_path / "c.npz")
+
+
+def test_an_archive_whose_members_would_begin_before_the_file_is_damaged(tmp_path):
+    np.savez(tmp_path / "a.npz", xyz=np.ones((20, 3)))
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    directory = int.from_bytes(data[-6:-2], "little")  # where the list of members is said to be
+    data[-6:-2] = (directory + 40).to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(DataError, match="a.npz: damaged.*Invalid argument"):
+        read_npz(tmp_path / "a.npz")
