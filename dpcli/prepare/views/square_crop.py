@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
 
+_LARGEST = 12_000  # pixels of a square's side, above 8K video; more take gigabytes to make smaller
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
 
@@ -21,7 +23,14 @@ class Crop:
     side: int
 
     def apply(self, rgba: np.ndarray, size: int) -> np.ndarray:
-        """Cuts u8 (H,W,4) to u8 (size,size,4); transparent where the square reaches over the picture."""
+        """Cuts u8 (H,W,4) to u8 (size,size,4); transparent where the square reaches over the picture.
+
+        Raises DataError for a square that no camera takes, as a damaged picture's size asks for.
+        """
+        if self.side > _LARGEST:
+            raise DataError(
+                f"a square of {self.side:,} pixels would be cut out; expected at most {_LARGEST:,}: make the pictures smaller first"
+            )
         height, width = rgba.shape[:2]
         square = np.zeros((self.side, self.side, 4), np.uint8)
         x0, y0 = max(self.left, 0), max(self.top, 0)

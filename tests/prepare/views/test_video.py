@@ -854,3 +854,9 @@ def test_images_of_rarer_suffixes_are_frames(tmp_path, suffix):
     read, written = next(frames.read([0])), disc((20, 24), 8)
     assert len(frames) == 3 and np.abs(read[24, 20].astype(int) - written[24, 20]).max() <= 6
     assert (read[0, 0, 3] == 0) == (suffix in ("tga", "jp2"))
+
+
+def test_a_square_that_no_camera_takes_is_refused():
+    """The size that a damaged GIF tells: the picture itself is narrow, the square around it would take 25 GB."""
+    with pytest.raises(DataError, match="a square of 82,000 pixels would be cut out; expected at most 12,000"):
+        Crop(-41_000, 0, 82_000).apply(np.zeros((65_559, 32, 4), np.uint8), 16)
