@@ -18,8 +18,8 @@ from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.regular_files import stand_in
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.other_files import stand_in
 
 if TYPE_CHECKING:
     from dpcli.prepare.decode.video_streams import VideoStream

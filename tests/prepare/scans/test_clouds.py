@@ -260,7 +260,7 @@ def test_what_else_lies_there_is_named(tmp_path):
 @pytest.mark.parametrize("name", ["0.ply", "0.pcd", "0.las", "0.npy", "0.bin", "0.csv", "0.npz"])
 def test_what_stands_in_for_a_file_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
-    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; fetch the file itself: git lfs pull"):
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
         read_cloud(tmp_path / name)
     (tmp_path / name).write_bytes(b"<!DOCTYPE html>\n<html><body>Sign in</body></html>")
     with pytest.raises(DataError, match=f"{name}: a web page; download it again"):
