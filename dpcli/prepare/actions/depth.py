@@ -174,10 +174,10 @@ class DepthVideos:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         video, recorded = self._video(item)
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
-        scale = self._scale(video.frames.dtype)
+        scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
-        notes |= video.notes | (doubts_of_units(depth) if self._declared_scale is None else {})
+        notes |= video.notes | ({} if told else doubts_of_units(depth))
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
@@ -186,13 +186,13 @@ class DepthVideos:
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
         points, counts = back_project(depth, camera, unit=unit, near=self.near, far=self.far)
-        require_plausible(str(item.path), points[:, 2], scale, asked=self._declared_scale is not None)
+        require_plausible(str(item.path), points[:, 2], scale, asked=told)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         sequence = CloudSequence(
             item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
         )
         if item.extra["recording"] and not (recorded or self.calibration or self.intrinsics or self.fov):
-            notes[f"recordings without camera_info, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
+            notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return Sample(sequence, {**notes, **dropped})
 
     def _video(self, item: Item) -> tuple[DepthVideo, Calibration | None]:
@@ -201,8 +201,8 @@ class DepthVideos:
             return read_depth_video(item.path, self.stride, item.extra["series"]), None
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
-        read, camera = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
+        read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale), camera
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -223,11 +223,15 @@ class DepthVideos:
         """Returns raw units per meter as the user or the calibration says them."""
         return self.depth_scale or (self.calibration.depth_scale if self.calibration else None)
 
-    def _scale(self, kind: np.dtype) -> float:
-        """Returns raw units per meter: the user's, the calibration's, or what is usual for the type of number."""
+    def _scale(self, video: DepthVideo) -> tuple[float, bool]:
+        """Returns raw units per meter (the user's, the calibration's, the recording's, or what is usual for the type of
+        number) and whether somebody said them.
+        """
+        kind = video.frames.dtype
         if self.calibration and not self.depth_scale and kind.kind != "f":
             self.calibration.require_clear_scale()
-        return self._declared_scale or usual_scale(kind)
+        told = self._declared_scale or (video.scale if kind.kind != "f" else None)
+        return told or usual_scale(kind), told is not None
 
     def _inverted(self, frames: np.ndarray, path: Path) -> np.ndarray:
         """Returns depth (T,H,W) as the sensor counts it, 0 = nothing seen."""

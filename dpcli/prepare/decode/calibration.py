@@ -26,18 +26,9 @@ _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", 
 _MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
 _WIDTH = ("width", "w", "image_width", "depthwidth", "m_depthwidth")
 _HEIGHT = ("height", "h", "image_height", "depthheight", "m_depthheight")
-_SCALE = (
-    "depth_scale",
-    "depthmapfactor",
-    "depthscale",
-    "depth_factor",
-    "depth_units",
-    "depth_unit",
-    "png_depth_scale",
-    "depth_shift",
-    "integer_depth_scale",
-    "depth_unit_scale_factor",
-    "m_depthshift",
+_SCALE = re.compile(  # a key of the depth scale without what is no letter, and the unit that it may end with
+    r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
+    r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
 )
 _LENS = (
     "coeffs",
@@ -53,6 +44,7 @@ _TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenC
 _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
+_ABOUT_CAMERAS = "distortions?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
 _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
@@ -157,9 +149,11 @@ def _of_lines(path: Path, text: str) -> dict[str, Any]:
     """Returns what lines of ``key = value`` say, or a row of names and one of values. Raises DataError where two lines differ."""
     lines = [re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines()]
     pairs = [(pair[0], _number_or_text(pair[1])) for pair in lines if len(pair) == 2]
-    rows = [re.split(r"\s*[,;\t]\s*", line.strip()) for line in text.splitlines() if line.strip()]
+    sign = next((sign for sign in ";\t" if sign in text), ",")  # beside these commas are decimal ones
+    rows = [[cell.strip() for cell in line.split(sign)] for line in text.splitlines() if line.strip()]
     if not pairs and len(rows) == 2 and len(rows[0]) == len(rows[1]):
-        pairs = [(name, _number_or_text(value)) for name, value in zip(*rows)]
+        points = [value if sign == "," else value.replace(",", ".") for value in rows[1]]
+        pairs = [(name.strip('"'), _number_or_text(value.strip('"'))) for name, value in zip(rows[0], points)]
     data = dict(pairs)
     twice = next((name for name, value in pairs if data[name] != value), None)
     if twice:
@@ -320,7 +314,18 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
         if _holds_camera(own):
             yield name, {**outer, **own}
         for key, value in data.items():
-            yield from _cameras(f"{name}/{key}".lstrip("/"), value, around, depth + 1)
+            lens = {"distortion": other for said, other in data.items() if _is_lens_of(str(said), str(key))}
+            yield from _cameras(f"{name}/{key}".lstrip("/"), value, {**around, **lens}, depth + 1)
+
+
+def _is_lens_of(key: str, camera: str) -> bool:
+    """Returns whether a key says that it holds the lens of the camera beside it, such as ``depthDistortion`` of
+    ``depthIntrinsic``.
+    """
+    if not re.search("distort", key, re.IGNORECASE):
+        return False
+    plain = [re.sub(_ABOUT_CAMERAS, "", re.sub("[^a-z]", "", word.lower())) for word in (key, camera)]
+    return plain[0] == plain[1]
 
 
 def _holds_camera(part: dict[str, Any]) -> bool:
@@ -371,6 +376,8 @@ def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
 def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
     values = _first(own, _LENS)
+    told = own.get("distortion")  # as RealSense's tools print it, or what stands beside the coefficients
+    told = _first({str(k).lower(): v for k, v in told.items()}, _MODEL) if isinstance(told, dict) else told
     if isinstance(values, dict):
         values = values["data"] if "data" in values else _named_terms(path, values)
     if values is None and any(key in own for key in _TERMS):
@@ -381,7 +388,7 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
     if not _are_numbers(flat):
         raise DataError(f"{path}: its lens has the coefficients {str(flat):.80}; expected numbers")
-    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat)
+    return lens_coefficients(path, str((isinstance(told, str) and told) or _first(own, _MODEL) or ""), flat)
 
 
 def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
@@ -400,7 +407,7 @@ def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, 
     """
     if not any(flat):
         return ()
-    model = name.lower().replace("distortion.", "").replace("-", "_")
+    model = re.sub("[- ]", "_", name.lower().replace("distortion.", ""))
     if model not in _BROWN or len(flat) not in (4, 5, 8, 12, 14):
         raise DataError(
             f"{path}: its lens is of model {model or 'unknown'} with {len(flat)} coefficients that aren't all 0; expected"
@@ -410,15 +417,36 @@ def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, 
 
 
 def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> float | None:
-    """Returns raw units per meter; small values are meters per unit, as RealSense has them."""
+    """Returns raw units per meter; small values are meters per unit, as RealSense has them.
+
+    Raises DataError where what is said is no scale, or two scales differ.
+    """
     top = {str(key).lower(): value for key, value in whole.items()}
-    value = next((part[name] for part in (own, top) for name in _SCALE if part.get(name) is not None), None)
-    if value is None and "scale" in own and "fx" in own:  # as mappers of rooms write it
-        value = own["scale"]
-    if value is None:
-        return None
+    said = [{k: v for k, v in part.items() if _is_scale(k) and v is not None} for part in (own, top)]
+    found = said[0] or said[1]
+    if not found and "scale" in own and "fx" in own:  # as mappers of rooms write it
+        found = {"depth_scale": own["scale"]}
+    scales = {key: _units_per_meter(path, key, value) for key, value in found.items()}
+    if scales and max(scales.values()) > 1.001 * min(scales.values()):
+        raise DataError(
+            f"{path}: {' and '.join(scales)} give different depth scales ({', '.join(f'{v:g}' for v in scales.values())} raw"
+            " units per meter); expected one of them"
+        )
+    return next(iter(scales.values()), None)
+
+
+def _is_scale(key: str) -> bool:
+    return _SCALE.fullmatch(re.sub("[^a-z]", "", key)) is not None
+
+
+def _units_per_meter(path: Path, key: str, value: Any) -> float:
+    """Returns the raw units per meter that a depth scale means. Its key may end with a unit, in which the value is then."""
     if isinstance(value, str) and (unit := unit_of(f"in {value}")):
         return 1 / UNITS[unit]
     if not _are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
+    match = _SCALE.fullmatch(re.sub("[^a-z]", "", key))
+    if match and (unit := unit_of(f"in {match[2]}")):
+        size = value * UNITS[unit] if match[1] != "per" else UNITS[unit] / value
+        return float(f"{1 / size:.12g}")
     return float(value) if value >= 1 else float(f"{1 / value:.12g}")

@@ -55,7 +55,7 @@ class DepthVideo:
 
     missing: how many more frames the file declares than it holds, such as a recording that was cut. ends_early: the file
     stops before its container does, whether or not it says how many frames there were. notes: counts of what else is
-    missing or doubtful.
+    missing or doubtful. scale: raw units per meter, where the file itself says so.
     """
 
     frames: np.ndarray
@@ -63,6 +63,7 @@ class DepthVideo:
     missing: int = 0
     ends_early: bool = False
     notes: dict[str, int] = field(default_factory=dict)
+    scale: float | None = None
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture

@@ -125,6 +125,12 @@ def test_matrices_of_numpy_and_opencv(tmp_path):
         ("depth_units", 0.001, 1000),
         ("scale", 6553.5, 6553.5),
         ("depth_unit", "mm", 1000),
+        ("depthScaleFactor", 10000, 10000),
+        ("Depth Scale", 0.0001, 10000),
+        ("depthUnitsMeters", 0.0001, 10000),
+        ("DepthScale(mm)", 0.1, 10000),
+        ("depth_units_per_meter", 10000, 10000),
+        ("depth_to_m", 0.0001, 10000),
     ],
 )
 def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, value, scale):
@@ -132,6 +138,43 @@ def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, va
     found = read_calibration(tmp_path / "k.json")
     assert found.depth_scale == pytest.approx(scale)
     found.require_clear_scale()
+
+
+def test_what_only_sounds_like_a_depth_scale_is_none_and_two_that_differ_are_refused(tmp_path):
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_max": 4, "depth_to_color": [1], "unit": 2}))
+    assert read_calibration(tmp_path / "k.json").depth_scale is None
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_scale": 1000, "depthUnits": 0.0001}))
+    with pytest.raises(DataError, match="depth_scale and depthunits give different depth scales .1000, 10000 raw"):
+        read_calibration(tmp_path / "k.json")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"depthIntrinsic": PLAIN, "depthDistortion": {"k1": 0.2, "k2": 0.0}, "rgbDistortion": {"k1": 0.9}},
+        {"intrinsics": PLAIN, "distortion": {"model": "plumb_bob", "k1": 0.2}},
+        {"depth": {"intrinsics": PLAIN, "distortion_coefficients": [0.2, 0, 0, 0, 0]}},
+    ],
+)
+def test_the_lens_may_stand_beside_the_camera(tmp_path, content):
+    (tmp_path / "k.json").write_text(json.dumps(content))
+    found = read_calibration(tmp_path / "k.json").intrinsics
+    assert isinstance(found, LensIntrinsics) and found.distortion[0] == 0.2
+    (tmp_path / "k.json").write_text(json.dumps(content).replace("plumb_bob", "kannala_brandt4"))
+    if "model" in str(content):
+        with pytest.raises(DataError, match="model kannala_brandt4"):
+            read_calibration(tmp_path / "k.json")
+
+
+def test_a_lens_that_a_text_names_and_numbers_of_a_german_table(tmp_path):
+    lines = "PPX: 325\nPPY: 237\nFx: 600\nFy: 601\nDistortion: {}\nCoeffs: 0.1 0 0 0 0\n"
+    (tmp_path / "k.txt").write_text(lines.format("Brown Conrady"))
+    assert read_calibration(tmp_path / "k.txt").intrinsics.distortion[0] == 0.1
+    (tmp_path / "k.txt").write_text(lines.format("Inverse Brown Conrady"))
+    with pytest.raises(DataError, match="model inverse_brown_conrady"):
+        read_calibration(tmp_path / "k.txt")
+    (tmp_path / "k.csv").write_text("fx;fy;cx;cy\n" + ";".join(str(PLAIN[k]) for k in PLAIN).replace(".", ","))
+    assert read_calibration(tmp_path / "k.csv").intrinsics == CAMERA
 
 
 def test_a_depth_scale_that_may_mean_two_things_is_refused_where_it_counts(tmp_path):
