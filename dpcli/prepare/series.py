@@ -233,7 +233,13 @@ def choose_series(
         return None
     found = _mixed_formats(folder, all_series(folder, frames))
     left_out: list[Series] = []
-    rules = (_numbered, lambda s: _preferred(s, suffixes), _no_texts, lambda s: _wanted(s, wanted), _more_than_one)
+    rules = (
+        _numbered,
+        lambda s: _preferred(s, suffixes, judge),
+        _no_texts,
+        lambda s: _wanted(s, wanted),
+        _more_than_one,
+    )
     for rule in rules:
         kept = rule(found)
         left_out += [one for one in found if one not in kept]
@@ -295,14 +301,24 @@ def _numbered(found: list[Series]) -> list[Series]:
     return [one for one in found if one.numbered] or found
 
 
-def _preferred(found: list[Series], suffixes: Sequence[str]) -> list[Series]:
-    """Returns the series without twins: those that hold the same frames in a format that is less preferred."""
+def _preferred(
+    found: list[Series], suffixes: Sequence[str], judge: Callable[[Path], bool] | None = None
+) -> list[Series]:
+    """Returns the series without twins: those that hold the same frames in a format that is less preferred, or that are
+    none by ``judge``, such as pictures of depth beside arrays of it.
+    """
     ranks = {suffix: rank for rank, suffix in enumerate(suffixes)}
+    twins = [one for one in found if any(_are_twins(one, other) for other in found)]
+    pictures = [one for one in twins if judge is not None and not judge(one.paths[0])]
     kept: list[Series] = []
-    for one in sorted(found, key=lambda one: ranks.get(one.suffix, len(ranks))):
-        if not any(other.suffix != one.suffix and one.stems & other.stems for other in kept):
+    for one in sorted(found, key=lambda one: (one in pictures, ranks.get(one.suffix, len(ranks)))):
+        if not any(_are_twins(one, other) for other in kept):
             kept.append(one)
     return [one for one in found if one in kept]
+
+
+def _are_twins(one: Series, other: Series) -> bool:
+    return one.suffix != other.suffix and not one.stems.isdisjoint(other.stems)
 
 
 def _no_texts(found: list[Series]) -> list[Series]:

@@ -18,6 +18,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.actions.depth_units import (
+    doubts_of_marks,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -53,7 +54,8 @@ _OTHER_PICTURES = re.compile(
     re.IGNORECASE,
 )
 _FOREIGN = tuple(  # that may hold depth, and are not read
-    ".mat .h5 .hdf5 .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo .svo2 .r3d .sens .xef .klg .dat .pkl".split()
+    ".mat .h5 .hdf5 .gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
+    " .svo2 .r3d .sens .xef .klg .dat .pkl".split()
 )
 _HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
@@ -178,6 +180,7 @@ class DepthVideos:
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
         notes |= video.notes | ({} if told else doubts_of_units(depth))
+        notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale

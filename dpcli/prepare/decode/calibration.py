@@ -314,7 +314,8 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
         if _holds_camera(own):
             yield name, {**outer, **own}
         for key, value in data.items():
-            lens = {"distortion": other for said, other in data.items() if _is_lens_of(str(said), str(key))}
+            beside = [other for said, other in data.items() if _is_lens_of(str(said), str(key))]
+            lens = {"distortion": beside[0]} if beside else {}
             yield from _cameras(f"{name}/{key}".lstrip("/"), value, {**around, **lens}, depth + 1)
 
 

@@ -13,7 +13,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
-from dpcli.prepare.scans.cleaning import clean, ends_of
+from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
 from dpcli.store.schema import kept_name
 
@@ -64,7 +64,8 @@ def assemble(
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
-    notes |= {**dropped, **converted}
+    crowded = is_crowded(clouds[kept[len(kept) // 2]].points)
+    notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
     frames = [clouds[t].points for t in kept]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor

@@ -108,7 +108,10 @@ def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | N
         try:
             values = table.columns([place])[:, 0]
         except DataError:
-            return _values_of_words(table, column, table.words(place))
+            words = table.words(place)
+            if 2 * sum(word.isdecimal() for word in words) > len(words):
+                raise  # such as of a row of means below the others
+            return _values_of_words(table, column, words)
     else:
         values = moments
     _require_all(table, column, np.isfinite(values))

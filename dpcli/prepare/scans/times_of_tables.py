@@ -83,10 +83,11 @@ def seconds_of(column: str, values: np.ndarray) -> float:
         told = words_of(inside[1])
         if not set(told) <= _NO_UNITS:
             return _IN_BRACKETS.get(" ".join(told), 0.0)
-    if not (values == np.floor(values)).all():
-        return 1.0
     digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
-    unit = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 and set(words) & _TIME_WORDS else 0.0
+    epoch = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 else 0.0
+    if not (values == np.floor(values)).all():
+        return epoch or 1.0  # milliseconds since 1970 may have fractions
+    unit = epoch if set(words) & _TIME_WORDS else 0.0
     steps = np.diff(np.unique(values)) if unit else values[:0]
     return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
 

@@ -122,6 +122,16 @@ def test_a_frame_in_two_formats_is_one_frame(tmp_path):
     assert any("left out: *.npy (2 files)" in line for line in reader.summary(reader.items()))
 
 
+@pytest.mark.parametrize("picture", [np.full((6, 8), 99, np.uint8), RNG.integers(0, 255, (6, 8, 3)).astype(np.uint8)])
+def test_pictures_beside_arrays_of_depth_are_left_out(tmp_path, picture):
+    folder = write(tmp_path / "v", **{str(t): picture for t in range(2)})
+    for t in range(2):
+        np.save(folder / f"{t}.npy", depth(2000 + t))
+    reader, sequence = read(folder)
+    assert first_depths(sequence) == [2.0, 2.001]
+    assert any("left out: *.png (2 files)" in line for line in reader.summary(reader.items()))
+
+
 @pytest.mark.parametrize("channels", [("Y",), ("Z", "A"), ("R", "G", "B"), ("depth.V",), ("R", "G", "B", "Z")])
 def test_openexr_frames(tmp_path, channels):
     openexr = pytest.importorskip("OpenEXR")

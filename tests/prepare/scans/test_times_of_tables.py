@@ -37,6 +37,8 @@ def csv(path, header, rows):
         ("time [ticks]", [0.5, 0.75], None),
         ("timestamp", [1_234_567_890, 1_234_617_890], None),  # microseconds since the sensor began
         ("timestamp", [1_700_000_000, 1_700_000_030], [0, 30]),
+        ("timestamp", [1_700_000_000_000.5, 1_700_000_000_050.5], [0, 0.05]),
+        ("t", [0.5, 50.5], [0, 50]),
         ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
         ("time", ["11:59:59 AM", "12:00:00.5 pm"], [0, 1.5]),
         ("time", [45356.5, 45356.500001157], None),  # days, as spreadsheets count them
