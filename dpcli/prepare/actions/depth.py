@@ -42,7 +42,7 @@ from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
 if TYPE_CHECKING:
-    from dpcli.prepare.decode.calibration import Calibration
+    from dpcli.prepare.decode.pinhole_camera import Calibration
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"

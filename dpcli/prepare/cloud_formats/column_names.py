@@ -137,7 +137,9 @@ def _numbered_axes(names: Sequence[str]) -> list[int | None]:
 
 def find_colors(names: Sequence[str]) -> list[int]:
     """Returns the places of red, green and blue among the names, or of the one that holds all three; [] without."""
-    plain = [[word for word in words_of(name) if word not in _ABOUT_COLORS] for name in names]
+    plain = [
+        [word for word in words_of(name) if word not in _ABOUT_COLORS] if "%" not in name else [] for name in names
+    ]
     for trio in _COLORS:
         places = [[place for place, words in enumerate(plain) if words == [color]] for color in trio]
         if all(places):

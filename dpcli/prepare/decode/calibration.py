@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.text_files import check_depth, parse_json
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
@@ -24,8 +23,12 @@ _CX = ("cx", "ppx", "c_x", "mx_depth")
 _CY = ("cy", "ppy", "c_y", "my_depth")
 _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
 _MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
-_WIDTH = ("width", "w", "image_width", "depthwidth", "m_depthwidth")
-_HEIGHT = ("height", "h", "image_height", "depthheight", "m_depthheight")
+_SIZE_OF = (
+    "^(m|camera|cam|sensor)?(depth|ir|image|img|picture|frame|resolution|{})*"  # and before the names of both sides
+)
+_SIDES = ("(width|w|cols|columns)$", "(height|h|rows)$")
+_SIZE = re.compile("^(depth|image|img|frame|picture|camera)*(size|resolution|dimensions?|shape)$")
+_ASPECT = 1.5  # of the focal lengths, beyond which other numbers are meant
 _SCALE = re.compile(  # a key of the depth scale without what is no letter, and the unit that it may end with
     r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
     r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
@@ -45,8 +48,6 @@ _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_mode
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
 _ABOUT_CAMERAS = "distortions?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
-_AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
-_ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
 _MOST_NUMBERS = 64  # in an array
 _MOST_PIXELS = 1_000_000  # of a side of a picture
@@ -54,60 +55,6 @@ _EXPECTED = (
     'expected {"fx": .., "fy": .., "cx": .., "cy": ..} in pixels, a 3x3 or 4x4 matrix, or what RealSense, Open3D, ROS or'
     " COLMAP write"
 )
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
-
-    intrinsics: Intrinsics
-    width: int = 0
-    height: int = 0
-    depth_scale: float | None = None
-    source: str = "the options"
-
-    def of_pictures(self, width: int, height: int) -> Intrinsics:
-        """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
-
-        Raises DataError when they are of another shape, or when the principal point lies outside of the pictures.
-        """
-        own, found = f"{self.width}x{self.height}", f"{width}x{height}"
-        camera = self.intrinsics
-        if self.width and self.height and (self.width, self.height) != (width, height):
-            x, y = width / self.width, height / self.height
-            if abs(x / y - 1) > _ASPECT:
-                raise DataError(
-                    f"{self.source}: is of {own} pictures, these have {found}, which is another shape; expected the"
-                    " calibration of the depth camera itself"
-                )
-            middle = ((camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
-            camera = replace(camera, fx=camera.fx * x, fy=camera.fy * y, cx=middle[0], cy=middle[1])
-        if 0 < camera.cx <= 1 and 0 < camera.cy <= 1 and min(width, height) > 8:
-            raise DataError(
-                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be a fraction of the picture;"
-                f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
-            )
-        if not (-0.5 <= camera.cx <= width and -0.5 <= camera.cy <= height):
-            raise DataError(
-                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of these {found} pictures;"
-                " expected a calibration of pictures of this size, or its width and height beside it"
-            )
-        return camera
-
-    def require_clear_scale(self) -> None:
-        """Raises DataError when the declared raw units per meter are so few that they mean something else."""
-        if self.depth_scale is not None and self.depth_scale < _AMBIGUOUS:
-            raise DataError(
-                f"{self.source}: declares a depth scale that would be {self.depth_scale:g} raw units per meter, which is"
-                " hardly meant for whole numbers; give --depth-scale, such as 1000 for millimeters"
-            )
-
-    def notes(self) -> list[str]:
-        """Returns lines for the log about what the calibration declares beside the intrinsics."""
-        declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
-        declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
-        declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -127,6 +74,9 @@ def read_calibration(path: Path) -> Calibration:
     if (cameras := _colmap_lines(text)) and path.suffix.lower() == ".txt":
         return _of_colmap(path, cameras)
     numbers = _only_numbers(text)
+    names = re.findall(r"\w+", text[1 : text.find("\n")]) if text.startswith("#") else []
+    if numbers is not None and "fx" in names and len(names) == len(numbers):
+        return _of_mapping(path, dict(zip(names, numbers)))
     if numbers is not None:
         return _of_numbers(path, numbers)
     return _of_mapping(path, _parsed(path, text))
@@ -149,7 +99,7 @@ def _of_lines(path: Path, text: str) -> dict[str, Any]:
     """Returns what lines of ``key = value`` say, or a row of names and one of values. Raises DataError where two lines differ."""
     lines = [re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines()]
     pairs = [(pair[0], _number_or_text(pair[1])) for pair in lines if len(pair) == 2]
-    sign = next((sign for sign in ";\t" if sign in text), ",")  # beside these commas are decimal ones
+    sign = next((sign for sign in ";\t," if sign in text), None)  # beside the first two commas are decimal ones
     rows = [[cell.strip() for cell in line.split(sign)] for line in text.splitlines() if line.strip()]
     if not pairs and len(rows) == 2 and len(rows[0]) == len(rows[1]):
         points = [value if sign == "," else value.replace(",", ".") for value in rows[1]]
@@ -180,7 +130,7 @@ def _yaml(path: Path, text: str) -> Any:
 def _number_or_text(text: str) -> Any:
     """Returns the number that a text holds, the list of its numbers where it holds four or more, else the text itself."""
     try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
+        numbers = [float(word) for word in text.rstrip("; ").replace(",", " ").split()]
     except ValueError:
         return text
     return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= len(_TERMS[:4]) else text
@@ -216,6 +166,10 @@ def _only_numbers(text: str) -> list[float] | None:
 
 
 def _of_numbers(path: Path, numbers: list[float]) -> Calibration:
+    if len(numbers) in (4, 6) and max(numbers[-4:-2]) > _ASPECT * abs(min(numbers[-4:-2])):
+        raise DataError(
+            f"{path}: focal lengths {numbers[-4]:g} and {numbers[-3]:g}; expected fx fy cx cy, in this order"
+        )
     if len(numbers) == 4:
         return Calibration(_intrinsics(path, numbers, ()), source=str(path))
     if len(numbers) == 6:  # ARKit's .pincam: the size first
@@ -287,7 +241,7 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
     numbers = _pixels(path, own)
     lens = _lens(path, own)
-    size = _resolution(path, own)
+    size = _resolution(path, own, numbers[2:])
     scale = _depth_scale(path, own, data)
     return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
 
@@ -358,12 +312,41 @@ def _are_numbers(values: list[Any]) -> bool:
     )
 
 
-def _resolution(path: Path, own: dict[str, Any]) -> tuple[int, int]:
-    size = own.get("resolution")
-    pair = size if isinstance(size, list) and len(size) == 2 else [_first(own, _WIDTH), _first(own, _HEIGHT)]
-    if not all(isinstance(value, (int, float)) for value in pair) or any(value <= 0 for value in pair):
+def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[int, int]:
+    """Returns width and height of the pictures, 0 where nothing tells them. Two numbers of one entry stand in the order that
+    puts the principal point ``center`` nearer to the middle.
+    """
+    size = next((value for key, value in own.items() if _SIZE.match(_letters(key))), None)
+    if isinstance(size, dict):
+        return _resolution(path, {str(key).lower(): value for key, value in size.items()}, center)
+    if isinstance(size, str):
+        size = [float(number) for number in re.findall(r"\d+", size)]
+    pair = size if isinstance(size, list) and len(size) == 2 else _sides(own)
+    if not _are_numbers(pair) or any(value <= 0 for value in pair):
         return 0, 0
-    return _pixel_counts(path, *pair)
+    turned = size is pair and _off_middle(center, pair[::-1]) < _off_middle(center, pair)
+    return _pixel_counts(path, *(pair[::-1] if turned else pair))
+
+
+def _sides(own: dict[str, Any]) -> list[Any]:
+    """Returns the width and the height that a mapping names, those of the color camera only where there are no others."""
+    for other in ("-", "color|rgb"):
+        found = []
+        for side in _SIDES:
+            known = re.compile(_SIZE_OF.format(other) + side)
+            keys = sorted((key for key in own if known.match(_letters(key)) and own[key] is not None), key=len)
+            found.append(own[keys[0]] if keys else None)
+        if None not in found:
+            return found
+    return [None, None]
+
+
+def _letters(key: str) -> str:
+    return re.sub("[^a-z]", "", key)
+
+
+def _off_middle(center: list[float], size: list[float]) -> float:
+    return sum(abs((at + 0.5) / side - 0.5) for at, side in zip(center, size) if side > 0)
 
 
 def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
@@ -437,7 +420,7 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
 
 
 def _is_scale(key: str) -> bool:
-    return _SCALE.fullmatch(re.sub("[^a-z]", "", key)) is not None
+    return _SCALE.fullmatch(_letters(key)) is not None
 
 
 def _units_per_meter(path: Path, key: str, value: Any) -> float:
@@ -446,7 +429,7 @@ def _units_per_meter(path: Path, key: str, value: Any) -> float:
         return 1 / UNITS[unit]
     if not _are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
-    match = _SCALE.fullmatch(re.sub("[^a-z]", "", key))
+    match = _SCALE.fullmatch(_letters(key))
     if match and (unit := unit_of(f"in {match[2]}")):
         size = value * UNITS[unit] if match[1] != "per" else UNITS[unit] / value
         return float(f"{1 / size:.12g}")

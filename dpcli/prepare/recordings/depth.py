@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.calibration import Calibration
+from dpcli.prepare.decode.pinhole_camera import Calibration
 from dpcli.prepare.recordings.messages import CAMERA_KINDS, IMAGE_KINDS, calibration_of_message, depth_of_message
 from dpcli.prepare.recordings.recording import Recording, open_recording
 from dpcli.prepare.recordings.topic_frames import TopicFrames, read_topic

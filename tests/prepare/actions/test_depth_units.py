@@ -8,9 +8,8 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.actions.depth_units import require_plausible, without_marks
-from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.decode.folder_listing import unreadable_entries
-from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.scans.clouds import CloudFolders
 
 RNG = np.random.default_rng(0)

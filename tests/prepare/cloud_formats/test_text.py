@@ -317,6 +317,23 @@ def test_styles_of_headers(names, places, unit):
     assert find_axes(names.split("|") if "|" in names else names.split()) == (places, unit)
 
 
+@pytest.mark.parametrize(
+    ("header", "cell", "color"),
+    [
+        ("rgb", str(0x0A141E), [10, 20, 30]),
+        ("rgb", repr(float(np.array([0x0A141E], "u4").view("f4")[0])), [10, 20, 30]),  # as PCL has them
+        ("rgb", repr(float(np.array([0xFE0A141E], "u4").view("f4")[0])), [10, 20, 30]),
+        ("rgb", "0.5", None),
+        ("r [%],g [%],b [%]", "100,50,0", None),
+    ],
+)
+def test_colors_in_one_column_and_in_percent(tmp_path, header, cell, color):
+    (tmp_path / "a.csv").write_text(f"x,y,z,{header}\n1.5,2,3,{cell}\n")
+    cloud = read_text(tmp_path / "a.csv")
+    assert (cloud.color is None and cloud.unread == tuple(header.split(","))) if color is None else True
+    assert color is None or cloud.color.tolist() == [color]
+
+
 def test_names_that_mean_something_else():
     assert find_axes(["vx", "vy", "vz"]) is None and find_axes(["x", "y", "range"]) is None
     assert find_colors(["r", "azimuth", "g"]) == [] and find_colors(["x", "Red", "Green", "Blue"]) == [1, 2, 3]

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.decode.calibration import Calibration
-from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
 from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED

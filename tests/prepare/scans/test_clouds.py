@@ -277,6 +277,28 @@ def test_texts_of_a_vehicles_sensors_are_no_clouds(tmp_path):
     assert len(CloudFolders(tmp_path / "oxts").items()) == 1  # who names it, gets it
 
 
+def test_one_text_above_the_clouds_and_arrays_of_normals_are_no_clouds(tmp_path):
+    for folder in ("00/velodyne", "00/normals", "00/b"):
+        save(tmp_path / folder / "0.npy")
+    (tmp_path / "00" / "instances.txt").write_text("1 2 3\n4 5 6\n")
+    reader = CloudFolders(tmp_path)
+    assert [item.name for item in reader.items()] == ["00/b", "00/velodyne"]
+    assert "left out: 00/instances.txt, 00/normals/0.npy" in reader.summary(reader.items())[1]
+    save(tmp_path / "00" / "normals" / "1.npy")  # other frames: a sequence of that name
+    assert [item.name for item in CloudFolders(tmp_path).items()] == ["00/b", "00/normals", "00/velodyne"]
+
+
+def test_folders_that_may_each_be_a_moment_are_told(tmp_path):
+    for k in range(3):
+        for camera in "ab":
+            save(tmp_path / "raw" / f"t{k:04d}" / f"{camera}.npy")
+    reader = CloudFolders(tmp_path / "raw")
+    told = "3 folders such as t0000 hold a.npy, b.npy each: if a folder is one moment"
+    assert told in reader.summary(reader.items())[-1]
+    save(tmp_path / "raw" / "t0001" / "c.npy")
+    assert told not in "".join((again := CloudFolders(tmp_path / "raw")).summary(again.items()))
+
+
 @pytest.mark.parametrize(
     "row",
     [
