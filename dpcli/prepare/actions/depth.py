@@ -174,8 +174,8 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        video, recorded = self._video(item)
-        camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
+        video = self._video(item)
+        camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
@@ -194,18 +194,18 @@ class DepthVideos:
         sequence = CloudSequence(
             item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
         )
-        if item.extra["recording"] and not (recorded or self.calibration or self.intrinsics or self.fov):
+        if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return Sample(sequence, {**notes, **dropped})
 
-    def _video(self, item: Item) -> tuple[DepthVideo, Calibration | None]:
-        """Returns the frames of an item, and the camera that a recording describes."""
+    def _video(self, item: Item) -> DepthVideo:
+        """Returns the frames of an item, with the camera that a recording describes."""
         if not item.extra["recording"]:
-            return read_depth_video(item.path, self.stride, item.extra["series"]), None
+            return read_depth_video(item.path, self.stride, item.extra["series"])
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
         read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale), camera
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -268,6 +268,7 @@ class DepthVideos:
         if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
+                " where a file tells none"
             )
         if self.calibration:
             lines += self.calibration.notes()

@@ -82,6 +82,20 @@ def read_calibration(path: Path) -> Calibration:
     return _of_mapping(path, _parsed(path, text))
 
 
+def camera_of_arrays(
+    path: Path, arrays: dict[str, np.ndarray]
+) -> tuple[Calibration | None, float | None, tuple[str, ...]]:
+    """Returns the camera and the raw units per meter that small arrays beside those of depth tell, None where they don't, and
+    the names of the arrays that tell nothing of these.
+    """
+    small = {name: array for name, array in arrays.items() if array.size <= _MOST_NUMBERS and array.ndim <= 2}
+    told = {k.lower(): v.item() if v.size == 1 else v.tolist() for k, v in small.items() if v.dtype.kind in "uifU"}
+    camera = _of_mapping(path, told) if _holds_camera(told) else None
+    scale = camera.depth_scale if camera else _depth_scale(path, told, {})
+    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_LENS, *_MODEL, "width", "height") if camera else ()
+    return camera, scale, tuple(k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
+
+
 def _parsed(path: Path, text: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml"):

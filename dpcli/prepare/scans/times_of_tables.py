@@ -92,6 +92,19 @@ def seconds_of(column: str, values: np.ndarray) -> float:
     return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
 
 
+def unit_by_rate(column: str, values: np.ndarray, fps: float) -> float:
+    """Returns how many seconds one unit of a column of times in whole numbers is, if one makes its steps those of ``fps``; else
+    0.
+
+    >>> unit_by_rate("time", np.array([0, 33, 67, 100]), 30), unit_by_rate("t", np.array([0, 1, 2, 5]), 30)
+    (0.001, 0.0)
+    """
+    if not set(words_of(column)) & _TIME_WORDS or len(values) < 2:
+        return 0.0
+    step = float(np.median(np.diff(np.unique(values)))) * fps
+    return next((unit for unit in (1e-3, 1e-6, 1e-9) if 0.5 < step * unit < 2), 0.0)
+
+
 def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:
     """Returns the times that some of the columns ``names`` tell, in seconds or of a unit in the column's name."""
     found = []

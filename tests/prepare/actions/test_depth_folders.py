@@ -100,6 +100,21 @@ def test_archives_of_one_frame_each_are_one_clip_and_one_of_many_is_a_video(tmp_
         read(tmp_path / "two.npz")
 
 
+def test_what_an_archive_tells_beside_its_depth_is_used_or_named(tmp_path):
+    told = {"K": np.array([[50.0, 0, 4], [0, 51, 3], [0, 0, 1]]), "depth_scale": np.array([0.0001])}
+    (tmp_path / "frames").mkdir()
+    for t in range(2):
+        np.savez(tmp_path / "frames" / f"{t}.npz", depth=depth(1000 + t), times=[t], **told)
+    np.savez(tmp_path / "many.npz", depth=np.stack([depth(1000), depth(1001)]), times=[0, 1], **told)
+    for path in (tmp_path / "frames", tmp_path / "many.npz"):
+        reader, sequence = read(path)
+        np.testing.assert_allclose(sequence.points[0], [-4 / 50 / 10, -3 / 51 / 10, 0.1], rtol=1e-6)
+        notes = reader.read(reader.items()[0], RNG).notes
+        assert any("arrays that are not read (times)" in note for note in notes)
+        assert first_depths(read(path, depth_scale=1000)[1]) == [1.0, 1.001]
+        assert read(path, fov=60)[1].points[0, 0] < -0.05
+
+
 @pytest.mark.parametrize("matrices", [np.eye(4)[None], np.eye(3)[[1, 2, 0]], [[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]])
 def test_matrices_of_a_camera_are_no_depth(tmp_path, matrices):
     np.save(tmp_path / "poses.npy", matrices)

@@ -56,6 +56,20 @@ def test_units_in_the_names_of_times(tmp_path, name, values, expected):
         np.testing.assert_allclose(sequence.time, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "fps", "expected"),
+    [
+        ("time", [0, 33, 67, 100], 30, [0, 0.033, 0.067, 0.1]),
+        ("t", [5_000_000, 5_100_000, 5_200_000], 10, [0, 0.1, 0.2]),
+        ("t", [0, 1, 2, 5], 10, [0, 0.1, 0.2, 0.5]),
+        ("frame", [0, 33, 66], 30, [0, 1 / 30, 2 / 30]),
+    ],
+)
+def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values, fps, expected):
+    path = csv(tmp_path / "a.csv", f"{name},x,y,z", [(value, 1, 2, k) for k, value in enumerate(values)])
+    np.testing.assert_allclose(only_sequence(path, frame_column=name, fps=fps)[0].time, expected, atol=1e-6)
+
+
 def test_a_column_of_days_numbers_frames_by_their_rate(tmp_path):
     path = csv(tmp_path / "a.csv", "time,x,y,z", [(45356.5 + k * 1.157e-5, k, 1, 2) for k in range(3)])
     assert only_sequence(path, frame_column="time")[0].time is None
