@@ -28,10 +28,13 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
-    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
+    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
+    " .bag .mcap .db3 .active .bz2 .xz .zst".split()
 )
 _ADVICE = {
-    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "unpack them"),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst"), "unpack them"),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
+    ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     ".e57": "save their points as .ply, such as with CloudCompare",
 }

@@ -126,6 +126,8 @@ def test_shards_and_merges_keep_shifts(tmp_path):
         ((POINTS - 1) * 4000, "if these are millimeters, give --scale 1000"),
         ((POINTS + 1) * 1000, "if these are millimeters, give --scale 1000"),
         ((POINTS * 100).round(), "whole numbers, hardly meters; if they are millimeters, give --scale 1000"),
+        (POINTS * (1e-3, 1e-3, 9) + (8.4, 49, 115), "are these degrees?"),
+        (POINTS * (1e-3, 1e-3, 9), ""),  # a pole around which the axes stand
         (POINTS.round(), ""),
         (POINTS * 1000 + 448_000, ""),
         (POINTS * 100 - 80, ""),
