@@ -31,6 +31,7 @@ from dpcli.prepare.decode.depth_files import (
     DepthVideo,
     frame_series,
     read_depth_video,
+    require_depth,
     says_depth,
 )
 from dpcli.prepare.decode.folder_listing import walk_folders
@@ -49,7 +50,7 @@ CUT = "videos that end before their container does (truncated: frames may be los
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
-    r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|semantic|instance|segm|albedo|flow|image|photo"
+    r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
     r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
     re.IGNORECASE,
 )
@@ -174,6 +175,8 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
+        series: Series | None = item.extra["series"]
+        require_depth(item.path, f"{item.name} {series.pattern if series else ''}")
         video = self._video(item)
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
         scale, told = self._scale(video)

@@ -10,7 +10,7 @@ from dpcli.prepare.median import median
 _MARKS_16 = 65533  # this and more in 16 bits say that nothing was measured
 _MARKS_FLOAT = (65504.0, 65535.0)  # the largest half, and a mark of 16 bits that became a float
 _TOO_LARGE = 1e9  # raw floats beyond are marks, whatever the unit
-_PLAUSIBLE = (0.005, 200.0)  # meters that depth cameras see, typically
+_PLAUSIBLE = (0.005, 100.0)  # meters that depth cameras see, typically
 _PLAUSIBLE_IF_ASKED = (0.005, 1000.0)  # where the user gave the units
 _SAMPLED = 4096
 _ROUGH, _SMOOTHER = 0.01, 8.0  # how much neighbors differ, as a share of the mean; how much less with bytes swapped
@@ -139,7 +139,7 @@ def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: boo
     if least <= typical <= most:
         return
     raw = typical * scale
-    better = next((own for own in (1 / scale, 1000.0, 1.0, 10_000.0) if 0.1 <= raw / own <= 100.0), None)
+    better = next((own for own in (1 / scale, 1000.0, 1.0, 10_000.0, 100.0) if 0.2 <= raw / own <= 100.0), None)
     hint = (
         f"did you mean --depth-scale {better:.6g}, which makes it {raw / better:.3g} m?"
         if better

@@ -31,6 +31,7 @@ ARRAY_SUFFIXES = (".npy", ".npz")
 FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  # of two files of one frame the earlier is preferred
 # names that say depth, and not a picture of it or what lies beside it
 _DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
+_OTHERWISE = re.compile(r"disparit|(?<![a-z])disp(_?map)?(?![a-z])|(?<![a-z])inv(erse)?[-_ ]?depth", re.IGNORECASE)
 _GRAY_NOISE, _COLORED_SHARE = (
     24,
     0.02,
@@ -353,6 +354,17 @@ def says_depth(name: str) -> bool:
     (True, False, False)
     """
     return re.search(_DEPTH_NAME, name, re.IGNORECASE) is not None
+
+
+def require_depth(path: Path, name: str) -> None:
+    """Raises DataError where a video's name says that it holds disparities or the inverse of depth."""
+    said = _OTHERWISE.search(name)
+    if said and (said[0].lower().startswith("inv") or not says_depth(name)):
+        what = "the inverse of depth" if said[0].lower().startswith("inv") else "disparities"
+        raise DataError(
+            f"{path}: by its name it holds {what}, not depth; depth is focal length x baseline / disparity. Save it as depth,"
+            " or call it otherwise if it is"
+        )
 
 
 def _is_frame(path: Path) -> bool:

@@ -115,6 +115,33 @@ def test_what_an_archive_tells_beside_its_depth_is_used_or_named(tmp_path):
         assert read(path, fov=60)[1].points[0, 0] < -0.05
 
 
+@pytest.mark.parametrize(
+    ("folder", "names", "what"),
+    [
+        ("disparity", "{}", "disparities"),
+        ("v", "{}_disp", "disparities"),
+        ("inv_depth", "{}", "the inverse of depth"),
+        ("disparity", "{}_depth", ""),
+        ("display", "{}", ""),
+    ],
+)
+def test_what_is_no_depth_by_its_name_is_refused(tmp_path, folder, names, what):
+    write(tmp_path / "in" / folder, **{names.format(t): depth(1000 + t) for t in range(2)})
+    if what:
+        with pytest.raises(DataError, match=f"by its name it holds {what}, not depth"):
+            read(tmp_path / "in")
+    else:
+        assert first_depths(read(tmp_path / "in")[1]) == [1.0, 1.001]
+
+
+def test_disparities_beside_depth_are_left_out(tmp_path):
+    for folder, least in (("disparity", 1000), ("depth", 2000)):
+        write(tmp_path / "in" / folder, **{str(t): depth(least + t) for t in range(2)})
+    reader, sequence = read(tmp_path / "in")
+    assert first_depths(sequence) == [2.0, 2.001]
+    assert "left out, by their names beside depth: disparity" in reader.summary(reader.items())
+
+
 @pytest.mark.parametrize("matrices", [np.eye(4)[None], np.eye(3)[[1, 2, 0]], [[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]])
 def test_matrices_of_a_camera_are_no_depth(tmp_path, matrices):
     np.save(tmp_path / "poses.npy", matrices)

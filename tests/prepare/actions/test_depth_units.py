@@ -121,6 +121,8 @@ def test_far_scenes_pass_when_the_user_says_so():
     with pytest.raises(DataError, match="500 m"):
         require_plausible("v", np.full(9, 500, np.float32), 1.0, asked=False)
     require_plausible("v", np.empty(0, np.float32), 1.0, asked=False)
+    with pytest.raises(DataError, match="did you mean --depth-scale 100, which makes it 1.2 m"):  # centimeters
+        require_plausible("v", np.full(9, 120, np.float32), 1.0, asked=False)
 
 
 def test_the_units_of_a_calibration_are_used_unless_others_are_given(tmp_path):
