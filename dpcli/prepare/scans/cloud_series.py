@@ -75,9 +75,10 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[
 
     def is_log(one: Series) -> bool:
         if one.suffix not in TEXTS:
+            if one.folder == root or not _OF_POINTS.fullmatch(one.folder.name):
+                return False
             twins = [other for other in scans if other.folder.parent == one.folder.parent and other is not one]
-            named = _OF_POINTS.fullmatch(one.folder.name) and one.folder != root
-            return named is not None and any(one.stems == other.stems for other in twins)
+            return any(one.stems == other.stems for other in twins)
         above = len(one.names) == 1 and any(one.folder in other.folder.parents for other in scans)
         return above or any(_ABOUT_SENSORS.fullmatch(part) for part in one.folder.relative_to(root).parts)
 
