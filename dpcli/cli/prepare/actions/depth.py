@@ -14,7 +14,7 @@ from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from dpcli.prepare.decode.calibration import Calibration
+    from dpcli.prepare.decode.pinhole_camera import Calibration
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class DepthCamera:
             raise UsageError("--intrinsics and --fx --fy --cx --cy were both given; use one")
         if not self.intrinsics and all(v is None for v in pixels):
             return None
-        from dpcli.prepare.decode.calibration import Calibration, read_calibration
-        from dpcli.prepare.decode.pinhole_camera import Intrinsics
+        from dpcli.prepare.decode.calibration import read_calibration
+        from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 
         if self.intrinsics:
             return read_calibration(self.intrinsics)
