@@ -16,7 +16,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, DpcError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.progress import log
@@ -69,8 +69,16 @@ def _end_with_parent() -> None:
 
 
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
+    """Raises DpcError where the machine has no place for what processes share, as some containers without /dev/shm."""
     ensure_server()
-    return ProcessPoolExecutor(min(jobs, _MOST), multiprocessing.get_context("forkserver"), _start_worker, (log.debug,))
+    forked = multiprocessing.get_context("forkserver")
+    try:
+        return ProcessPoolExecutor(min(jobs, _MOST), forked, _start_worker, (log.debug,))
+    except (OSError, ImportError) as error:
+        said = error.strerror if isinstance(error, OSError) else error
+        raise DpcError(
+            f"this machine lets processes share no locks, which lie in /dev/shm ({said}); --jobs 1 needs none"
+        ) from None
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:

@@ -76,7 +76,6 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Returns the validation videos' accuracy by stream, fused once both streams are trained."""
-        assert self.validation is not None
         static_only = (
             self.stage == 0 or not self.schedule.epochs_dynamic
         )  # the dynamic stream is not trained yet, or never
@@ -145,7 +144,6 @@ class Trainer:
 
     def _take(self, points: torch.Tensor, labels: torch.Tensor, clips: torch.Tensor, rate: float) -> bool:
         """Takes one step of all processes together; returns whether one of them was asked to stop."""
-        assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
         torch.manual_seed(torch_seed(*where))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)

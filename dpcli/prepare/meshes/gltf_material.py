@@ -86,10 +86,11 @@ def _change(reference: dict[str, Any]) -> dict[str, Any]:
 def _numbers(file: Gltf, index: int, values: Any, rest: tuple[int, ...]) -> tuple[float, ...]:
     try:
         found = tuple(float(np.clip(value, 0, 1)) for value in (values or rest))
-        assert len(found) == len(rest) and np.isfinite(found).all()
-    except (TypeError, ValueError, AssertionError):
+    except (TypeError, ValueError):
+        found = ()
+    if len(found) != len(rest) or not np.isfinite(found).all():
         count = {3: "three", 4: "four"}[len(rest)]
-        raise file.fail(f"material {index}: its color is not {count} numbers; export the file again") from None
+        raise file.fail(f"material {index}: its color is not {count} numbers; export the file again")
     return found
 
 

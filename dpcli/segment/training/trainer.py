@@ -260,7 +260,6 @@ class Trainer:
 
     def _validation_batches(self) -> list[Batch]:
         """Returns the held-out pairs with their first flows, which are estimated once."""
-        assert self.validation is not None
         pairs = epoch_order(self.validation, 0, self.schedule.validation_pairs)
         batches = []
         for start in range(0, len(pairs), self.schedule.batch):

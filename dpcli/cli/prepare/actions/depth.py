@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class DepthCamera:
     """Holds the options that say which camera filmed."""
 
-    HEADING: ClassVar = "Camera"
+    HEADING: ClassVar[str] = "Camera"
     intrinsics: Annotated[
         Path | None, typer.Option("--intrinsics", help="File of RealSense, Open3D, ROS, COLMAP, or with fx fy cx cy.")
     ] = None
