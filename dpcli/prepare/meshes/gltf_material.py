@@ -46,11 +46,12 @@ def read_material(file: Gltf, index: int) -> Material:
     if not 0 <= strength < np.inf:
         raise file.fail(f"material {index}: its emission has the strength {strength}; export the file again")
     glow = tuple(strength * value for value in _numbers(file, index, entry.get("emissiveFactor"), (0, 0, 0)))
+    mode = str(entry.get("alphaMode", "OPAQUE"))
     shines = any(glow) and not unlit
     return Material(
         _numbers(file, index, color, (1, 1, 1, 1)),
         _texture(file, texture) if texture else None,
-        str(entry.get("alphaMode", "OPAQUE")).lower(),
+        mode.lower() if mode in ("MASK", "BLEND") else "opaque",  # other words are none, as viewers have it
         float(entry.get("alphaCutoff", 0.5)),
         unlit,
         emission=glow if shines else (0.0, 0.0, 0.0),

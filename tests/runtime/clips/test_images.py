@@ -149,6 +149,18 @@ def test_white_at_0_and_alpha_in_the_gray_of_a_tiff_are_read(tmp_path):
         assert (read[..., 3] == alpha).all() and np.abs(read[..., 0] - gray).max() <= (3 if alpha < 255 else 0), name
 
 
+def test_a_channel_of_a_tiff_that_may_be_alpha_is_told_when_it_is_not_read(tmp_path, capsys):
+    """Pillow takes four samples of which the last has no meaning for three; straight and multiplied alpha it reads."""
+    Image.fromarray(np.full((8, 8, 4), 100, np.uint8)).save(tmp_path / "a.tif")
+    data, tag = (tmp_path / "a.tif").read_bytes(), struct.pack("<HHI", 338, 3, 1)
+    assert data.count(tag) == 1
+    for extra, color, alpha in ((0, 100, 255), (1, 255, 100), (2, 100, 100)):
+        (tmp_path / "a.tif").write_bytes(data.replace(tag + b"\2", tag + bytes([extra])))
+        read = read_rgba(tmp_path / "a.tif")
+        assert (read == (color, color, color, alpha)).all(), extra
+        assert ("further channel" in capsys.readouterr().err) == (extra == 0)
+
+
 def with_chunk(png: bytes, name: bytes, data: bytes) -> bytes:
     """A PNG with one chunk more behind its head."""
     chunk = struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

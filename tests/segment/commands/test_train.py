@@ -129,6 +129,12 @@ def test_a_wrong_choice_is_named_before_anything_is_made(words, said, dpc_here, 
     assert not (tmp_path / "model").exists()
 
 
+def test_a_run_that_diverges_is_told(dpc_here, data, tmp_path):
+    done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, "--set", "lr=1e12")
+    said = done.stderr.decode()
+    assert done.returncode == 1 and "training diverged (epoch " in said and "with a smaller lr" in said, said
+
+
 def test_the_settings_beside_the_weights_make_the_same_run(dpc_here, data, run_folder, tmp_path):
     """`settings.toml` alone continues the run; what it says was resolved from the preset and the options."""
     said = read_toml(run_folder / "settings.toml")
