@@ -120,7 +120,8 @@ class SceneOptimizer:
     @torch.no_grad()
     def require_finite(self) -> None:
         """Raises FloatingPointError where the model can't be drawn in some frame."""
-        self.model.require_finite(self.model.at(self.times))
+        for number in range(len(self.times)):  # one at a time: all frames of a large model fill the memory
+            self.model.require_finite(self.model.at(self.times[number : number + 1]))
 
     def _step_generator(self) -> torch.Generator:
         return torch.Generator().manual_seed(torch_seed(self.seed, Generate4DStream.STEP, self.step))
