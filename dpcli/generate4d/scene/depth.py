@@ -6,23 +6,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_KEPT = (
-    0.75  # share of the change of depth that takes the whole clip; chosen on clips of known tracks, of which each gains
-)
+_KEPT = 0.75  # share of slow change of depth; chosen on clips of known tracks, of which each gains
+_SLOW = 2  # half swings over the clip that are slow: a way to or fro, and one to and fro
 
 
 def calm_depth(places: Tensor, pose: np.ndarray) -> Tensor:
-    """Returns places f (T,N,3) whose depth in a camera (world_to_camera (4,4)) changes once to and fro over the clip, and less.
+    """Returns places f (T,N,3) whose depth in a camera (world_to_camera (4,4)) changes slowly, and less.
 
-    Every place stays on its ray, so that the camera's pictures stay as they are but for the size of what came nearer.
-    What lies at or behind the camera isn't touched.
+    Depth over time keeps the first cosines of its discrete cosine transform, so that what walks towards the camera need not
+    return. Every place stays on its ray, so that the camera's pictures stay as they are but for the size of what came
+    nearer. What lies at or behind the camera isn't touched.
     """
     turn, shift = torch.from_numpy(pose[:3, :3]).to(places), torch.from_numpy(pose[:3, 3]).to(places)
     center = -turn.T @ shift
     ray = places - center
     depth = ray @ turn[2]
-    angle = torch.arange(len(depth)).to(depth)[:, None] * (2 * torch.pi / len(depth))
-    slow = torch.cat([torch.ones_like(angle), angle.cos(), angle.sin()], 1)
+    half_swings = torch.arange(_SLOW + 1).to(depth) * torch.pi / len(depth)
+    slow = torch.cos((torch.arange(len(depth)).to(depth)[:, None] + 0.5) * half_swings)
     mean = depth.mean(0)
     calm = mean + _KEPT * (slow @ (torch.linalg.pinv(slow) @ depth) - mean)
     before = (depth > 0).all(0) & (calm > 0).all(0)

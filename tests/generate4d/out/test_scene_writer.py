@@ -47,7 +47,7 @@ def test_parts_are_those_that_move_apart_unless_the_temporal_cue_is_off():
 
 
 def test_of_motion_along_the_line_of_sight_only_what_is_slow_is_kept():
-    """A fit with a shape prior: depth trembles and sways, the picture stays, and so does what a fit without it found."""
+    """A fit with a shape prior: what comes nearer and trembles comes nearer; the picture stays, as does a fit without one."""
     model = Model4D(CanonicalGaussians(torch.rand(40, 3) - 0.5, torch.zeros(40, 3), opacity=0.9), FIT_PRESETS["tiny"])
     pose, lens = orbit_pose(30.0, 10.0), pinhole(DEFAULT_FOVY, 16, 16)
     targets = Targets("box", torch.zeros(1, 8, 16, 16, 4), lens[None], pose[None], np.arange(8.0), 0)
@@ -55,16 +55,15 @@ def test_of_motion_along_the_line_of_sight_only_what_is_slow_is_kept():
 
     def swaying(points: torch.Tensor, times: torch.Tensor):
         motion, turn = forward(points, times), 2 * np.pi * (times * 7 / 8)[:, None, None]
-        shift = (0.2 * turn.sin() + 0.1 * (4 * turn).cos()) * axis + 0.1 * (4 * turn).cos() * torch.linalg.cross(
-            axis, torch.tensor([0.0, 0.0, 1.0])
-        )
+        near, tremble = 0.2 * (turn / 2 + np.pi / 16).cos(), 0.1 * (3 * turn + 3 * np.pi / 8).cos()
+        shift = (near + tremble) * axis + tremble * torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0]))
         return replace(motion, displacement=motion.displacement + shift)
 
     model.field.forward = swaying
     asis, calm = (to_scene(model, targets, {}, calm=calm) for calm in (False, True))
     before, after = ((scene.frame_mean @ pose[:3, :3].T + pose[:3, 3]) for scene in (asis, calm))
     np.testing.assert_allclose(after[..., :2] / after[..., 2:], before[..., :2] / before[..., 2:], atol=1e-5)
-    depth = before[..., 2].mean(0) + 0.75 * 0.2 * np.sin(2 * np.pi * np.arange(8) / 8)[:, None]
+    depth = before[..., 2].mean(0) + 0.75 * 0.2 * np.cos(np.pi * (np.arange(8) + 0.5) / 8)[:, None]
     np.testing.assert_allclose(after[..., 2], depth, atol=1e-5)
     assert (asis.part == calm.part).all()
 
