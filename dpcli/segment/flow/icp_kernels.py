@@ -206,6 +206,31 @@ def icp_kernel(source, search, motion, steps, wide, narrow, share):
 
 
 @kernel
+def linearize_kernel(source, search, motion, scale, share, matrix, vector, center):
+    """Computes the Gauss-Newton step of robust ICP at a motion: matrix (6,6), vector (6), and the center (3) it turns about.
+
+    Residuals and weights as in `icp_kernel`, at one scale.
+    """
+    cloud, normals, near, count = search[0], search[1], search[3], source.shape[1]
+    moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
+    at, far = np.empty(count, np.int64), np.empty(count, np.float32)
+    work = np.empty(max(cloud.shape[1], near.shape[2] * count), np.float32)
+    for k in range(3):
+        total = 0.0
+        for i in range(count):
+            s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
+            moved[k, i] = s + motion[k, 3]
+            rounded[k, i] = moved[k, i]
+            total += moved[k, i]
+        center[k] = total / count
+    _look_up(rounded, search, work, work.view(np.int32), at, far)
+    _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector)
+    for i in range(6):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
+
+
+@kernel
 def residual_kernel(source, search, motion, share, out, at):
     """Computes squared residuals (n) of source (3,n) moved by motion, as f64 into `out`, and the nearest, i64 into `at`.
 

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.flow.icp_kernels import cover_kernel, hypotheses_kernel, icp_kernel, residual_kernel
+from dpcli.segment.flow.icp_kernels import (
+    cover_kernel,
+    hypotheses_kernel,
+    icp_kernel,
+    linearize_kernel,
+    residual_kernel,
+)
 
 _CELL, _MARGIN = 0.03, 0.12  # of the grid, in diameters of the cloud: callers scale their clouds to about 1
 _CELLS = 96  # at most, along an axis
@@ -79,6 +85,17 @@ class Surface:
         motions, score = motions[best], score[best]
         hypotheses_kernel(source, self._search, motions, steps - half, middle, narrow, *settings, score)
         return motions, score
+
+    def linearize(
+        self, source: np.ndarray, motion: np.ndarray, scale: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the normal equations of a step of `icp` at a motion: matrix (6,6), vector (6), center (3).
+
+        Their solution is a rotation vector about the center, and a shift. source (3,n) f32, n >= 1.
+        """
+        matrix, vector, center = np.empty((6, 6)), np.empty(6), np.empty(3)
+        linearize_kernel(source, self._search, motion, scale, SHARE, matrix, vector, center)
+        return matrix, vector, center
 
     def residuals(self, source: np.ndarray, motion: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""

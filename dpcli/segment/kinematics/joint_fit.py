@@ -42,7 +42,7 @@ def fit_joint(seen: Registration, directions: np.ndarray | None = None) -> Joint
     """
     points = seen.center + seen.size * np.concatenate([np.eye(3), -np.eye(3)])
     target = moved(seen.motion, points)
-    first = [_fit_fixed(target, points), _fit_prismatic(target, points), _fit_revolute(seen.motion, target, points)]
+    first = [_fit_fixed(target, points), *nearest_joints(seen.motion, points)]
     tried = [_weighed(seen, fit, points) for fit in first]
     for fit in first[1:]:
         near = [d for d in (() if directions is None else directions) if abs(d @ fit.axis) > _NEAR]
@@ -74,7 +74,7 @@ def _weighed(seen: Registration, start: JointFit, points: np.ndarray, choice: fl
         return tilted / max(float(np.linalg.norm(tilted)), 1e-9), start.point + shift
 
     def whitened(parameters: np.ndarray, value: np.ndarray) -> np.ndarray:
-        placed = _joint_motion(start.kind, *joint(parameters), value) @ twist_motion(parameters[:6], seen.center)
+        placed = joint_motion(start.kind, *joint(parameters), value) @ twist_motion(parameters[:6], seen.center)
         return np.einsum("tij,tj->ti", white, motion_twist(back @ placed, seen.center))
 
     def misfit(parameters: np.ndarray) -> np.ndarray:
@@ -87,7 +87,7 @@ def _weighed(seen: Registration, start: JointFit, points: np.ndarray, choice: fl
     steps = len(value) - 1
     parameters = count - 6 + (0 if start.kind == FIXED else steps)
     length = 2 * solved.cost + parameters * np.log(max(6 * steps, 2)) + (choice or 0.0)
-    residual = _residual(moved(_joint_motion(start.kind, axis, point, value), points), moved(seen.motion, points))
+    residual = _residual(moved(joint_motion(start.kind, axis, point, value), points), moved(seen.motion, points))
     return JointFit(start.kind, axis, point, value, residual, float(length + (_RARE if start.kind == FIXED else 0.0)))
 
 
@@ -105,7 +105,13 @@ def _at_best_value(
     return error + slope * change[:, None], start.value + change
 
 
-def _joint_motion(kind: int, axis: np.ndarray, point: np.ndarray, value: np.ndarray) -> np.ndarray:
+def nearest_joints(motion: np.ndarray, points: np.ndarray) -> list[JointFit]:
+    """Returns the slide and the hinge that take points (M,3) nearest to where motions f64 (T,4,4) do."""
+    target = moved(motion, points)
+    return [_fit_prismatic(target, points), _fit_revolute(motion, target, points)]
+
+
+def joint_motion(kind: int, axis: np.ndarray, point: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Returns the motions f64 (T,4,4) of a joint at its values (T)."""
     motion = np.tile(np.eye(4), (len(value), 1, 1))
     if kind == PRISMATIC:

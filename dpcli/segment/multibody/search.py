@@ -7,6 +7,8 @@ import numpy as np
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of, label_points, refit, without_empty
 from dpcli.segment.multibody.frames import Frames
 from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
+from dpcli.segment.multibody.joint_motions import simplify_motions
+from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
 
@@ -23,7 +25,8 @@ def explain_sequence(
     tracks: the identity i64 (n_t) of each point, which makes correspondences exact; none: they are searched.
     """
     if tracks is None:
-        return Search(Frames(clouds), settings).run()
+        searched = Frames(clouds)
+        return simplify_motions(searched, turn_least(searched, Search(searched, settings).run()))
     frames = TrackedFrames(clouds, tracks, settings.flexible)
     return Search(frames, settings, patch_hypotheses(frames)).run()
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from dpcli.segment.flow import icp_kernels, motion_proposals
 from dpcli.segment.flow.object_aware_icp import soft_match, soft_match_reference
 from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
-from dpcli.segment.flow.surface_icp import Surface
+from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.network.se3_conv import _activate, instance_norm
 from tests.support.ops_helpers import backend
 
@@ -148,3 +149,15 @@ def test_energy_is_the_sum_of_its_terms() -> None:
     found = search._with_energy(label, motion, cost).energy
     assert found == pytest.approx(slow_energy(search, label, motion, cost), rel=1e-6)
     assert found != pytest.approx(slow_energy(search, label, motion[[1, 0, 2]], cost), rel=1e-3)
+
+
+def test_a_linearized_step_is_the_step_that_icp_makes():
+    points = np.float32(np.random.default_rng(5).random((120, 3)) * [1, 0.6, 0.2])
+    surface, start = Surface(points), np.eye(3, 4)
+    start[:, 3] = 0.01
+    matrix, vector, center = surface.linearize(columns(points[:50]), start, 0.05)
+    assert np.array_equal(matrix, matrix.T) and np.allclose(center, points[:50].mean(0) + 0.01, atol=1e-6)
+    step = np.linalg.solve(matrix, vector)
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = np.concatenate([turn @ start[:, :3], (turn @ (start[:, 3] - center) + center + step[3:])[:, None]], 1)
+    assert np.allclose(surface.icp(columns(points[:50]), start, 1, 0.05, 0.05), moved, atol=1e-5)

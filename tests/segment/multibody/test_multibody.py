@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.segment.multibody.explanation import Explanation
+from dpcli.segment.multibody.explanation import Explanation, body_of, label_points
 from dpcli.segment.multibody.frames import Frames, choose_partners, move, relative_motion
 from dpcli.segment.multibody.hypotheses import Hypothesis
+from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.label_kernels import alike_kernel, mean_field_kernel, support_kernel
+from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.search import Search, explain_sequence
 from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
@@ -194,6 +196,69 @@ def test_the_true_motion_explains_a_point_and_a_wrong_one_does_not():
     assert own < 0.75 * wrong
     step = relative_motion(sequence.pose[:, 0, :3], 1, 3)
     assert np.allclose(step, (sequence.pose[3, 0] @ np.linalg.inv(sequence.pose[1, 0]))[:3])
+
+
+def bottle(rng, count):
+    """Points on a cone with a closed end, alike around z."""
+    angle, height = 2 * np.pi * rng.random(count), 0.9 * np.sqrt(rng.random(count))
+    radius = np.where(rng.random(count) < 0.85, 0.1 + 0.1 * height, 0.19 * rng.random(count))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.where(radius < 0.1, 0.9, height)], 1)
+
+
+@pytest.mark.parametrize(
+    "thing, about, lost",
+    [
+        (bottle, 0.0, True),  # said to turn about the axis around which it is alike: turned back
+        (lambda rng, count: box_surface(rng, count, (0, 0, 0), (0.3, 0.5, 0.9)), 0.5, False),  # what turns is left so
+    ],
+)
+def test_a_body_turns_about_its_own_axis_only_as_far_as_its_points_demand(thing, about, lost):
+    rng = np.random.default_rng(0)
+    swing = [turn(0.15 * t, (1.0, 0.0, 0.0), (0.0, 0.0, 0.4)) for t in range(4)]
+    true = np.stack([m @ turn(about * t, (0.0, 0.0, 1.0), (0.1, 0.2, 0.0)) for t, m in enumerate(swing)])
+    frames = Frames([np.float32(thing(rng, 400) @ m[:3, :3].T + m[:3, 3]) for m in true])
+    spun = np.stack([m @ turn(a, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)) for m, a in zip(true, (0, 0.9, -0.6, 0.3))])
+    said = (spun if lost else true)[:, :3]
+    found = label_points(frames, [body_of(frames, said)], MultibodySettings())
+    after = turn_least(frames, found).bodies[0].trajectory
+    assert degrees_between(after, true[:, :3]).max() < 6
+    assert (after is found.bodies[0].trajectory) == (not lost)
+
+
+def degrees_between(one, other):
+    """The angles in degrees by which the relative motions of two trajectories, since frame 0, differ."""
+    turns = [relative_motion(one, 0, t)[:, :3].T @ relative_motion(other, 0, t)[:, :3] for t in range(1, len(one))]
+    return np.degrees([np.arccos(np.clip((np.trace(r) - 1) / 2, -1, 1)) for r in turns])
+
+
+def test_a_lid_moves_by_its_hinge_and_what_no_joint_explains_stays_free():
+    sequence = chest(points=200)
+    frames = Frames(np.split(sequence.points, sequence.frame_offsets[1:-1]))
+    whole, lid = (np.ascontiguousarray(sequence.pose[:, k, :3], np.float64) for k in (0, 1))
+    fitted = frames.fit(lid, sequence.part == 1, False, 0.5)  # six numbers a frame take noise along
+    found = label_points(frames, [body_of(frames, m) for m in (whole, fitted)], MultibodySettings(), sequence.part)
+    found.label = sequence.part.astype(np.int64)
+    hinged = simplify_motions(frames, found).bodies[1].trajectory
+    assert degrees_between(hinged, lid).mean() < 0.6 * degrees_between(fitted, lid).mean()
+    relative = np.stack([m[:, :3] for m in map(relative_motion, [whole] * 3, [0] * 3, [1, 2, 3])])
+    against = np.stack([r.T @ relative_motion(hinged, 0, t)[:, :3] for t, r in enumerate(relative, 1)])
+    axes = np.stack([[r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]] for r in against])
+    assert np.linalg.svd(axes)[1][1] < 1e-6  # one axis for all frames
+
+    stray = [
+        turn(0.0, (0, 0, 1.0), (0, 0, 0)),
+        turn(0.5, (1.0, 0, 0), (0.1, 0, 0.9)),
+        turn(0.4, (0, 1.0, 0), (0, 0.3, 0)),
+    ]
+    rng = np.random.default_rng(1)
+    clouds = [
+        np.concatenate([box_surface(rng, 200, (0, 0, 0), (0.5, 0.6, 0.3)), b @ m[:3, :3].T + m[:3, 3]])
+        for m, b in ((m, box_surface(rng, 120, (0.1, 0.1, 0.5), (0.15, 0.3, 0.4))) for m in stray)
+    ]
+    frames = Frames([np.float32(cloud) for cloud in clouds])
+    motions = [np.tile(np.eye(3, 4), (3, 1, 1)), np.stack(stray)[:, :3]]
+    found = label_points(frames, [body_of(frames, m) for m in motions], MultibodySettings())
+    assert simplify_motions(frames, found).bodies[1] is found.bodies[1]
 
 
 def test_partners_are_equally_many_and_never_the_frame_itself():
