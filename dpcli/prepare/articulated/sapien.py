@@ -163,7 +163,7 @@ class Sapien:
         counts = Counter(good.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
         names = f" of {len(self.class_names)} categories" if self.class_names else ""
-        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"]
+        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"] if good else []
 
 
 def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
