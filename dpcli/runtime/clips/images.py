@@ -55,7 +55,11 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
     """Opens an image whose size is plausible. Raises DataError where it isn't, and what Pillow does for one that is damaged."""
     from PIL import Image
 
-    with Image.open(_with_alpha_of_webp(path) or path) as image:
+    try:
+        opened = Image.open(_with_alpha_of_webp(path) or path)
+    except Image.DecompressionBombError as error:
+        raise DataError(f"{path}: not a picture of plausible size ({error}); export it smaller") from None
+    with opened as image:
         require_plausible(path, *image.size, path.stat().st_size)
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
