@@ -138,11 +138,8 @@ class MultiBodySync:
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         points, part, poses = read_views(item.path)
-        missing = item.extra["parts"] - poses.shape[1]
-        padding = np.tile(np.eye(4), (len(poses), missing, 1, 1))
-        sequence = CloudSequence.from_frames(
-            item.name, list(points), part=list(part), pose=np.concatenate([poses, padding], axis=1), **describe(item)
-        )
+        sequence = CloudSequence.from_frames(item.name, list(points), part=list(part), pose=poses, **describe(item))
+        sequence.pad_parts(item.extra["parts"])
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
