@@ -25,7 +25,8 @@ def simplify_motions(frames: Frames, found: Explanation) -> Explanation:
     """Returns the explanation with hinges and slides where a body's own motion in every frame explains little more.
 
     Motions are chosen by their description length: costs of the body's points, and a price for each number. A free motion
-    has six numbers a frame, a hinge one and the four of its line, a slide one and the two of its direction. Labels stay.
+    has six numbers a frame, a hinge one and the four of its line, a slide one and the two of its direction. Labels and costs
+    stay as they are.
     """
     bodies = found.bodies[:1]
     for k, body in enumerate(found.bodies[1:], start=1):

@@ -21,8 +21,7 @@ def turn_least(frames: Frames, found: Explanation) -> Explanation:
     """Returns the explanation with bodies that turn no more than their points demand.
 
     The points of a bottle say little of how far it turned about its own axis, so that the search ends anywhere. The largest
-    body is compared with standing still from frame to frame, the others with the largest. Labels stay: they were found with
-    the motions that explain most.
+    body is compared with standing still from frame to frame, the others with the largest. Labels and costs stay as they are.
     """
     still = np.tile(np.eye(3, 4), (len(frames), 1, 1))
     largest = _least_turning(frames, found.bodies[0], found.label == 0, still)

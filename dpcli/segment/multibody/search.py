@@ -25,8 +25,9 @@ def explain_sequence(
     tracks: the identity i64 (n_t) of each point, which makes correspondences exact; none: they are searched.
     """
     if tracks is None:
-        searched = Frames(clouds)
-        return simplify_motions(searched, turn_least(searched, Search(searched, settings).run()))
+        search = Search(Frames(clouds), settings)
+        found = turn_least(search.frames, search.run())
+        return search.judged_anew(simplify_motions(search.frames, found))
     frames = TrackedFrames(clouds, tracks, settings.flexible)
     return Search(frames, settings, patch_hypotheses(frames)).run()
 
@@ -49,6 +50,10 @@ class Search:
                 break
             found = better
         return self._tighten(found)
+
+    def judged_anew(self, found: Explanation) -> Explanation:
+        """Returns the explanation with labels by its bodies' motions as they now are, and without needless bodies."""
+        return self._prune(self._clean(label_points(self.frames, found.bodies, self.settings, found.label)))
 
     def _first(self) -> Explanation:
         """Returns the explanation by the one body that explains most."""
