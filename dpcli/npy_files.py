@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 
@@ -21,12 +24,31 @@ def require_room(path: Path, claimed: int) -> None:
         raise DataError(f"{path}: claims {claimed} bytes of arrays; a file of {held} bytes can't hold such clouds")
 
 
+@contextmanager
+def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Opens a ZIP, as a `.npz` is. Raises DataError where two members have one name, since only the last would be read;
+    BadZipFile and what else zipfile raises of a damaged one pass.
+    """
+    with zipfile.ZipFile(path) as archive:
+        require_distinct(path, archive.namelist())
+        yield archive
+
+
+def require_distinct(path: object, names: Sequence[str]) -> None:
+    """Raises DataError where a ZIP has two members of one name."""
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise DataError(
+            f"{path}: two members of the archive are named {twice!r}; unpack it, choose one and pack it anew"
+        )
+
+
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of a `.npz` by name; other files in the archive are passed over.
 
     Raises DataError when it is damaged, needs a pickle, or an array has other bytes than its header says.
     """
-    with reading(path), zipfile.ZipFile(path) as archive:
+    with reading(path), open_archive(path) as archive:
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
         return {one.filename[: -len(".npy")]: read_member(path, archive.read(one)) for one in members}

@@ -33,24 +33,6 @@ def why_unreadable(path: str | Path) -> str:
     return f"{kind}{_EXPECTED}" if kind else ""
 
 
-_STAND_INS = {  # how files begin that came instead of the data, in small letters: what is said of them
-    b"version https://git-lfs": "a pointer of Git LFS; fetch the file itself: git lfs pull",
-    b"<!doctype html": "a web page; download it again",
-    b"<html": "a web page; download it again",
-}
-
-
-def stand_in(path: Path) -> DataError | None:
-    """Returns the error about a file that could not be read because it only stands in for the data; None of other files."""
-    try:
-        with open(path, "rb") as file:
-            start = file.read(64).lstrip().lower()
-    except OSError:
-        return None
-    said = next((said for begin, said in _STAND_INS.items() if start.startswith(begin)), None)
-    return DataError(f"{path}: {said}") if said else None
-
-
 _refusing = False  # whether this process is inside `regular_files_only`
 
 

@@ -35,12 +35,23 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path), path)
 
 
-def parse_json(text: str | bytes, where: object) -> Any:
-    """Returns what JSON text of `where` says. DataError when it is none, too deep, or has half a letter in a string."""
+def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Returns the mapping of what one in JSON says. ValueError where a key has two values: no one can tell which is meant."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"two values of the key {twice[:80]!r} in one mapping; keep one of them")
+    return found
+
+
+def parse_json(text: str | bytes, where: object, as_browsers: bool = False) -> Any:
+    """Returns what JSON text of `where` says. DataError when it is none, too deep, or has half a letter in a string, or two
+    values of one key; of those ``as_browsers`` takes the last.
+    """
     try:
         if isinstance(text, bytes):
             text = text.decode("utf-8-sig")
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=None if as_browsers else distinct_keys)
         if _HALF.search(text):
             json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:

@@ -91,7 +91,7 @@ def test_what_is_imported_is_declared_and_nothing_more() -> None:
     )
     optional |= {"dask", "huggingface-hub", "llvmlite"}  # come with distributed, diffusers and numba
     used = set().union(*(imported(path) for path in (ROOT / "dpcli").rglob("*.py")))
-    foreign = {name for name in used - {"dpcli"} if name not in sys.stdlib_module_names}
+    foreign = {name for name in used - {"dpcli", "tomllib"} if name not in sys.stdlib_module_names}
     found = {canonicalize_name(DISTRIBUTION.get(name, name)) for name in foreign}
     assert found - optional == declared and found <= declared | optional
 

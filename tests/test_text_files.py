@@ -16,6 +16,13 @@ def test_what_is_no_json_is_said_with_the_name(data, tmp_path):
         read_json(path)
 
 
+def test_two_values_of_one_key_are_refused_unless_browsers_read_the_file():
+    text = '{"a": [{"fx": 1, "b": 2, "fx": 3}]}'
+    with pytest.raises(DataError, match="k.json: is not JSON .two values of the key 'fx' in one mapping; keep one"):
+        parse_json(text, "k.json")
+    assert parse_json(text, "k.json", as_browsers=True) == {"a": [{"fx": 3, "b": 2}]}
+
+
 def test_a_byte_order_mark_and_pairs_of_surrogates_are_read(tmp_path):
     path = tmp_path / "meta.json"
     path.write_bytes(b'\xef\xbb\xbf{"a": "\\ud83d\\ude00 \xc3\xa9"}')

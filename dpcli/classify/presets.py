@@ -42,6 +42,7 @@ _SPARSE = {
     "dropout": 0.4,
     "members": 4,
     "copies": True,
+    "slot_details": True,
 }
 
 

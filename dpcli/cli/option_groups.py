@@ -2,7 +2,7 @@
 
 @dataclass(frozen=True)
 class Camera:
-    HEADING: ClassVar = "Camera"  # over these options in the help; without one they stand among the command's own
+    HEADING: ClassVar[str] = "Camera"  # over these options in the help; without one they stand among the command's own
     size: Annotated[int, typer.Option("--size", help="Side of the pictures, pixels.")] = 512
 
 @app.command()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -47,7 +48,11 @@ class FitRun:
         with Progress("fit", self.steps, "step") as bar:
             bar.skip(self.optimizer.step)
             while self.optimizer.step < self.steps:
-                self._record(self._take_step())
+                with self._told_where_it_diverges():
+                    result = self.optimizer.take_step()
+                    if self._is_kept(self.optimizer.step):
+                        self.optimizer.require_finite()
+                self._record(result)
                 bar.note(**self._averages())
                 bar.advance()
                 step = self.optimizer.step
@@ -68,12 +73,21 @@ class FitRun:
             self.seconds, self.recent = state["spent"], state["recent"]
             self.optimizer.restore(state)
 
-    def _take_step(self) -> StepResult:
+    def _is_kept(self, step: int) -> bool:
+        """Returns whether the model after this step is drawn or saved."""
+        return step % _SAVE_EVERY == 0 or step == self.steps or step % self._between_previews == 0
+
+    @property
+    def _between_previews(self) -> int:
+        return max(self.steps // _PREVIEWS, 1)
+
+    @contextmanager
+    def _told_where_it_diverges(self) -> Iterator[None]:
         try:
-            return self.optimizer.take_step()
+            yield
         except FloatingPointError as error:
             raise DpcError(
-                f"{self.folder.path}: {error}; the last checkpoint is kept; try smaller rates or another --seed"
+                f"{self.folder.path}: step {self.optimizer.step}: {error}; the last checkpoint is kept; try smaller rates or another --seed"
             ) from None
 
     def _record(self, result: StepResult) -> None:
@@ -85,7 +99,7 @@ class FitRun:
             stage = "sparse" if self.optimizer.model.control is not None else "dense"
             self.folder.log({"step": step, "stage": stage, "seconds": round(self.seconds, 1), **self._averages()})
             self.recent = {key: values[-_AVERAGED:] for key, values in self.recent.items()}
-        if self.preview is not None and step % max(self.steps // _PREVIEWS, 1) == 0:
+        if self.preview is not None and step % self._between_previews == 0:
             self.preview(self.optimizer.model)
 
     def _averages(self) -> dict:

@@ -86,7 +86,7 @@ class SceneOptimizer:
         self.optimizer = self._new_optimizer()
 
     def take_step(self) -> StepResult:
-        """Takes the next step. Raises FloatingPointError, with the model as it was, when the loss is not finite."""
+        """Takes the next step. Raises FloatingPointError, with the model as it was, when it or the loss is not finite."""
         config, rng = self.config, self._step_generator()
         if self.step == config.sparse_from:
             self._begin_sparse()
@@ -96,6 +96,7 @@ class SceneOptimizer:
         views, frames = self._draw_pictures(rng)
         self._set_learning_rates()
         instant = self.model.at(self.times[frames])
+        self.model.require_finite(instant)
         loss, squared, notes = self._picture_terms(instant, views, frames, rng)
         if self.prior is not None:
             loss = loss + config.augmentation * self._prior_term(instant, frames, rng)
@@ -104,7 +105,7 @@ class SceneOptimizer:
         loss = loss + self._motion_terms(instant, frames)
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise FloatingPointError(f"the loss became {value} at step {self.step}")
+            raise FloatingPointError(f"the loss became {value}")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self._add_screen_gradient(notes)
@@ -115,6 +116,12 @@ class SceneOptimizer:
         if self.step % config.grow_every == 0 and self.step < config.steps - config.grow_every:
             self._densify(rng)
         return result
+
+    @torch.no_grad()
+    def require_finite(self) -> None:
+        """Raises FloatingPointError where the model can't be drawn in some frame."""
+        for number in range(len(self.times)):  # one at a time: all frames of a large model fill the memory
+            self.model.require_finite(self.model.at(self.times[number : number + 1]))
 
     def _step_generator(self) -> torch.Generator:
         return torch.Generator().manual_seed(torch_seed(self.seed, Generate4DStream.STEP, self.step))

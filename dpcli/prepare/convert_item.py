@@ -42,11 +42,15 @@ def _megabytes(path: Path) -> float:
 def _bytes(path: str | Path) -> int:
     if not os.path.isdir(path):
         return os.stat(path).st_size
-    with os.scandir(path) as entries:
-        return sum(
-            _bytes(entry.path) if entry.is_dir(follow_symlinks=False) else entry.stat(follow_symlinks=False).st_size
-            for entry in entries
-        )
+    total, folders = 0, [path]
+    while folders:  # which may lie deeper in one another than functions may call themselves
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+                else:
+                    total += entry.stat(follow_symlinks=False).st_size
+    return total
 
 
 def _converted(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +68,7 @@ class LabelTable:
 
 
 def _plain(name: str) -> str:
-    return name.replace("\\", "/").removeprefix("./")
+    return unicodedata.normalize("NFC", name.replace("\\", "/").removeprefix("./").rstrip("/"))  # macOS splits letters
 
 
 def _stem(name: str) -> str:
@@ -78,7 +79,7 @@ def _told_apart(names: Iterable[str]) -> dict[str, str]:
     """Returns the names of samples by themselves, and by what they are without a suffix where that is one sample's."""
     names = list(names)
     stems = Counter(map(_stem, names))
-    return {_stem(name): name for name in names if stems[_stem(name)] == 1} | {name: name for name in names}
+    return {_stem(name): name for name in names if stems[_stem(name)] == 1} | {_plain(name): name for name in names}
 
 
 def read_labels(path: Path) -> LabelTable:
@@ -178,6 +179,7 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         raise DataError(f"{path}: some labels are numbers and some are words; use one kind")
     else:
         class_names = sorted(set(words))
+    _warn_of_classes(path, class_names, {int(word) for word in words} if all(map(_is_number, words)) else {0})
     rows = {}
     for name, record in records.items():
         where = f"{path}:{record['line']}"
@@ -190,6 +192,15 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), split_called(split) or split)
     return LabelTable(path, rows, class_names)
+
+
+def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> None:
+    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals alone."""
+    if 0 not in labels:
+        log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")
+    for low, count in Counter(name.casefold() for name in class_names).items():
+        if count > 1:
+            log.warn(f"{path}: {' and '.join(n for n in class_names if n.casefold() == low)} are different classes")
 
 
 def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:

@@ -20,7 +20,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, tell_unclear_order
 
-_LISTED = 5
+_LISTED, _FEW = 5, 8
 _HEX = re.compile(r"(.*?)([0-9a-f]+)", re.IGNORECASE)
 _SIXTY = 60  # minutes and seconds end below
 TEXTS = (".txt", ".csv", ".tsv")
@@ -115,8 +115,27 @@ def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
         gaps = missing_numbers(series.numbers()) if series.times() is None else []
         if gaps:
             lines.append(f"{name}: its frames are numbered with gaps: {first_names(gaps, _LISTED)} missing")
+    if moments := _moments([series for _, series in clips]):
+        lines.append(moments)
     more = len(lines) - 2 * _LISTED
     return lines if more <= 0 else [*lines[: 2 * _LISTED], f"... and {more} more such folders"]
+
+
+def _moments(clips: Sequence[Series]) -> str:
+    """Returns a line for the log where folders that are numbered hold the same few names each, as where a folder is one moment
+    and its files are what several cameras saw then; "" otherwise.
+    """
+    folders = [one.folder for one in clips]
+    names = {one.names for one in clips}
+    beside = len(clips) > 2 and len(names) == 1 and len({folder.parent for folder in folders}) == 1
+    if not beside or len(next(iter(names))) > _FEW or len(all_series(folders[0].parent, [f.name for f in folders])) > 1:
+        return ""
+    if NumberColumns([parse_name(folder.name) for folder in folders]).varying() == []:
+        return ""
+    return (
+        f"{len(clips)} folders such as {folders[0].name} hold {', '.join(next(iter(names))[:3])} each: if a folder is one"
+        " moment, not one sequence, put the files of one camera into one folder"
+    )
 
 
 def _evenly(numbers: np.ndarray) -> np.ndarray:
@@ -233,7 +252,13 @@ def choose_series(
         return None
     found = _mixed_formats(folder, all_series(folder, frames))
     left_out: list[Series] = []
-    rules = (_numbered, lambda s: _preferred(s, suffixes), _no_texts, lambda s: _wanted(s, wanted), _more_than_one)
+    rules = (
+        _numbered,
+        lambda s: _preferred(s, suffixes, judge),
+        _no_texts,
+        lambda s: _wanted(s, wanted),
+        _more_than_one,
+    )
     for rule in rules:
         kept = rule(found)
         left_out += [one for one in found if one not in kept]
@@ -295,14 +320,24 @@ def _numbered(found: list[Series]) -> list[Series]:
     return [one for one in found if one.numbered] or found
 
 
-def _preferred(found: list[Series], suffixes: Sequence[str]) -> list[Series]:
-    """Returns the series without twins: those that hold the same frames in a format that is less preferred."""
+def _preferred(
+    found: list[Series], suffixes: Sequence[str], judge: Callable[[Path], bool] | None = None
+) -> list[Series]:
+    """Returns the series without twins: those that hold the same frames in a format that is less preferred, or that are
+    none by ``judge``, such as pictures of depth beside arrays of it.
+    """
     ranks = {suffix: rank for rank, suffix in enumerate(suffixes)}
+    twins = [one for one in found if any(_are_twins(one, other) for other in found)]
+    pictures = [one for one in twins if judge is not None and not judge(one.paths[0])]
     kept: list[Series] = []
-    for one in sorted(found, key=lambda one: ranks.get(one.suffix, len(ranks))):
-        if not any(other.suffix != one.suffix and one.stems & other.stems for other in kept):
+    for one in sorted(found, key=lambda one: (one in pictures, ranks.get(one.suffix, len(ranks)))):
+        if not any(_are_twins(one, other) for other in kept):
             kept.append(one)
     return [one for one in found if one in kept]
+
+
+def _are_twins(one: Series, other: Series) -> bool:
+    return one.suffix != other.suffix and not one.stems.isdisjoint(other.stems)
 
 
 def _no_texts(found: list[Series]) -> list[Series]:

@@ -14,9 +14,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
+from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Any
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, DpcError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.progress import log
@@ -68,9 +69,28 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
+class Worker(ForkServerProcess):
+    """A process that ends when its executor says so, although it ignores SIGTERM, which whoever stops a batch job sends to all."""
+
+    def terminate(self) -> None:
+        """Ends the process. From Python 3.12 on a broken executor holds a lock until its processes ended."""
+        self.kill()
+
+
+class _Workers(ForkServerContext):
+    Process = Worker
+
+
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
+    """Raises DpcError where the machine has no place for what processes share, as some containers without /dev/shm."""
     ensure_server()
-    return ProcessPoolExecutor(min(jobs, _MOST), multiprocessing.get_context("forkserver"), _start_worker, (log.debug,))
+    try:
+        return ProcessPoolExecutor(min(jobs, _MOST), _Workers(), _start_worker, (log.debug,))
+    except (OSError, ImportError) as error:
+        said = error.strerror if isinstance(error, OSError) else error
+        raise DpcError(
+            f"this machine lets processes share no locks, which lie in /dev/shm ({said}); --jobs 1 needs none"
+        ) from None
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -22,6 +24,7 @@ from dpcli.text_files import read_json
 
 _TOLD = 3  # differences named when a run can't be continued
 _LOCK = ".lock"
+_PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
 # What --force removes; the flows are those of `segment train`, the preview that of `generate4d fit`.
 _FILES = (
     "state.pt",
@@ -35,6 +38,34 @@ _FILES = (
     "flows_known.npy",
     "preview.png",
 )
+
+
+@dataclass
+class LossWatch:
+    """Says when a training has run away: no finite loss or gradient for five steps on end, or a loss that is on average above
+    `limit`. beside: what is said of that limit.
+    """
+
+    limit: float = math.inf
+    beside: str = ""
+    lost: int = 0
+    mean: float = math.nan
+
+    def see(self, loss: float, stepped: bool) -> str | None:
+        """Takes the loss after each step; returns a sentence once it is time to stop. stepped: the gradient was finite."""
+        self.lost = 0 if stepped and math.isfinite(loss) else self.lost + 1
+        if self.lost >= _PATIENCE:
+            return f"no finite loss or gradient in {_PATIENCE} steps on end"
+        if math.isfinite(loss):
+            self.mean = loss if math.isnan(self.mean) else 0.95 * self.mean + 0.05 * loss
+        return f"the loss grew to {self.mean:.3g}{self.beside}" if self.mean > self.limit else None
+
+
+def diverged(problem: str, where: str, remedy: str) -> DpcError:
+    """Returns the error of a training that ran away. remedy: what may help in another folder."""
+    return DpcError(
+        f"training diverged ({where}): {problem}.\nStart another -o{remedy}, or look at the data (dpc info FILE)"
+    )
 
 
 class RunFolder:

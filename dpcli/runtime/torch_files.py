@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
+from dpcli.npy_files import require_distinct
 
 
 def load_plain(path: Path) -> Any:
@@ -43,6 +44,7 @@ def check_members(path: Path) -> None:
         if file.read(4) != b"PK\x03\x04":
             return
         with zipfile.ZipFile(file) as archive:
+            require_distinct(path, archive.namelist())
             claimed = sum(one.file_size for one in archive.infolist())
     if claimed > path.stat().st_size:
         raise DataError(

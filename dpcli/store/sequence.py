@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.joints import PARENT, TYPE, TYPES
+from dpcli.store.joints import PARENT, TYPE, TYPES, no_joints
 from dpcli.store.schema import KEPT, TABLES
 
 POINT_FIELDS = {
@@ -109,6 +109,15 @@ class CloudSequence:
             if values is not None:
                 setattr(self, name, values.take(rows, axis=0))
         self.extra = {name: values.take(rows) for name, values in self.extra.items()}
+
+    def pad_parts(self, parts: int) -> None:
+        """Lets `pose` and `joint` speak of so many parts: those that the sequence lacks rest, without a joint above them."""
+        if self.pose is not None:
+            still = np.tile(np.eye(4), (self.num_frames, parts - self.pose.shape[1], 1, 1))
+            self.pose = np.concatenate([self.pose, still], axis=1)
+        if self.joint is not None:
+            none = no_joints(self.num_frames, parts - self.joint.shape[1])
+            self.joint = np.concatenate([self.joint, none], axis=1)
 
     def validate(self, num_classes: int = 0) -> None:
         """Raises DataError unless shapes, offsets, label and values are as the class says."""

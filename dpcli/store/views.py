@@ -261,15 +261,18 @@ class ViewsReader:
     @property
     def file(self) -> h5py.File:
         """Opens the file in this process unless it is open, and returns the handle."""
-        if self._file is None or not self._file.id.valid:
-            self._file = open_store(self.path, ["views"])
-            self._pictures = self._file["rgba"]  # looking a data set up costs as much as decoding a picture
+        self._open()
         return self._file
 
     @property
     def _rgba(self) -> h5py.Dataset:
-        assert self.file
+        self._open()
         return self._pictures
+
+    def _open(self) -> None:
+        if self._file is None or not self._file.id.valid:
+            self._file = open_store(self.path, ["views"])
+            self._pictures = self._file["rgba"]  # looking a data set up costs as much as decoding a picture
 
     def rgba(self, view: int, frame: int) -> np.ndarray:
         """Reads the picture u8 (H,W,4) of a view at a frame, straight alpha. One chunk is read."""

@@ -21,7 +21,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class SmallCamera(Camera):
-    HEADING: ClassVar = "Small camera"
+    HEADING: ClassVar[str] = "Small camera"
     size: Annotated[int, typer.Option("--size", min=1, help="Side of the small one.")] = 8
 
 

@@ -226,11 +226,14 @@ def test_a_library_that_never_comes_back_or_crashes_ends_with_a_sentence(how, nu
     process = subprocess.Popen(
         [sys.executable, "-c", DEAF, how], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    assert process.stdout.read(1) == b"x"
-    if number is not None:
-        time.sleep(0.5)  # it is in the loop by then
-        process.send_signal(number)
-    _, told = process.communicate(timeout=30)
+    try:
+        assert process.stdout.read(1) == b"x"
+        if number is not None:
+            time.sleep(0.5)  # it is in the loop by then
+            process.send_signal(number)
+        _, told = process.communicate(timeout=30)
+    finally:
+        process.kill()  # a loop that nothing ends would take a core from all other tests
     assert process.returncode == code, told
     assert words in told.decode() and told.count(b"dpc: error:") == (code < 0)
 

@@ -66,6 +66,8 @@ def main() -> None:
     parser.add_argument("--waits", default="0,0.05,0.1,0.2,0.5,1,2")
     parser.add_argument("--only", default="")
     given = parser.parse_args()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell's background jobs; commands would inherit it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     folder, faults, count = given.folder.resolve(), 0, 0
     if not (folder / "scores.h5").exists():
         make_data(folder)

@@ -172,6 +172,23 @@ def test_what_is_wrong_is_said(tmp_path, dpc_here):
         assert b"Traceback" not in done.stderr and not (tmp_path / "a.h5").exists()
 
 
+@pytest.mark.parametrize("setting", ["rate_mean=1e12,1e-4"])
+def test_a_fit_that_runs_away_is_told(setting, tmp_path, dpc_here):
+    """Before a picture is drawn, or a scene written, of Gaussians that are nowhere."""
+    views, out = toy_views(tmp_path / "toy.h5"), tmp_path / "s.h5"
+    small = ("--preset", "tiny", "--size", 16, *steps(2, 2), "--set", setting)
+    done = dpc_here("generate4d", "fit", views, "-o", out, *small)
+    said = done.stderr.decode()
+    assert done.returncode in (0, 1), said
+    if done.returncode:
+        assert (
+            "became NaN or infinite; the last checkpoint is kept; try smaller rates" in said
+            or "the loss became" in said
+        )
+    else:
+        assert np.isfinite(read_scene(out).frame_mean).all()
+
+
 def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     from dpcli.generate4d.fit import COLUMNS
     from dpcli.runtime.run_folder import RunFolder

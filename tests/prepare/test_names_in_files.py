@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -21,15 +22,18 @@ from dpcli.prepare.actions.nvgesture import NvGesture
 from dpcli.prepare.articulated.ogc import OgcRooms
 from dpcli.prepare.articulated.ogc_meshes import load_shape
 from dpcli.prepare.articulated.sapien import Sapien
-from dpcli.prepare.decode.depth_files import read_timed_video, read_video
+from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.decode.depth_files import read_array, read_timed_video, read_video
+from dpcli.prepare.decode.npz_frames import read_frames
 from dpcli.prepare.decode.video_streams import video_streams
-from dpcli.prepare.decode.zip_folders import list_folders
+from dpcli.prepare.decode.zip_folders import list_folders, read_files
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.recordings.recording import open_recording
 from dpcli.prepare.views.transforms_json import transforms_clip
 from dpcli.prepare.views.video import VideoOptions
 from dpcli.prepare.views.views_check import ArtemisIndex
 from dpcli.runtime.clips.video_frames import look_at_video
+from dpcli.runtime.torch_files import check_members
 
 _opened: list[str] = []
 
@@ -288,3 +292,19 @@ def test_members_of_a_zip_are_names_not_places(tmp_path):
     before = sorted(tmp_path.rglob("*"))
     assert set(list_folders(tmp_path / "a.zip")) == {"../../x", "/etc/y"}
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_members_of_one_name_in_an_archive_are_refused(tmp_path):
+    """zipfile and NumPy read the last of them and say nothing."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for value in (1.0, 2.0):
+            stream = io.BytesIO()
+            np.save(stream, np.full((1, 4, 3), value))
+            archive.writestr("data.npy", stream.getvalue())
+    reads = [read_cloud, read_array, lambda one: read_frames(one, "data"), check_members]
+    reads.append(lambda one: list(read_files(one, list_folders(one)[""])))
+    for read in reads:
+        with pytest.raises(DataError, match=r"a\.npz: two members of the archive are named 'data.npy'; unpack it"):
+            read(path)

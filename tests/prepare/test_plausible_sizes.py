@@ -18,6 +18,7 @@ from dpcli.prepare.decode.color_frames import read_rgba
 from dpcli.prepare.decode.depth_files import read_array, read_image
 from dpcli.prepare.decode.npz_frames import read_frames
 from dpcli.prepare.decode.safe_pickle import read_npz_member
+from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.animations import animation_times
 
 SIDE = 13_000  # 169 million pixels, just below the size from which Pillow refuses by itself
@@ -90,7 +91,7 @@ def _read_exr_bomb(folder):
 def test_a_picture_of_far_more_pixels_than_bytes_is_refused(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(PICTURES[name]())
-    for read in (animation_times,) if name == "a.gif" else (read_rgba, _read_image, read_image):
+    for read in (animation_times,) if name == "a.gif" else (read_rgba, read_mask, _read_image, read_image):
         with pytest.raises(DataError, match=rf"{name}: .*(can't hold such a picture|decompression bomb)"):
             read(path)
 

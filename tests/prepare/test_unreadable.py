@@ -16,7 +16,9 @@ from PIL import Image
 
 from dpcli.errors import DataError, DpcError
 from dpcli.prepare.actions.depth import find_videos
+from dpcli.prepare.actions.msraction3d import MSRAction3D
 from dpcli.prepare.actions.ntu60 import NTU60
+from dpcli.prepare.actions.preprocessed import open_preprocessed
 from dpcli.prepare.cloud_formats.arrays import read_npz
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
@@ -288,3 +290,22 @@ def test_folders_deeper_than_can_be_listed_are_no_bug(tmp_path, monkeypatch, cap
     finally:
         subprocess.run(["rm", "-r", "d"], check=True)  # Python's own removal calls itself as deep
     assert code in (0, 3) and "a bug" not in capsys.readouterr().err  # newer Pythons list without calling themselves
+
+
+LINKED = {
+    "msraction3d": ("a01_s01_e01_sdepth.bin", MSRAction3D),
+    "preprocessed": ("a01_s01_e01.npz", open_preprocessed),
+    "pts_label": ("gesture_1/finger_1/subject_1/essai_1/pts_label.npy", open_preprocessed),
+}
+
+
+@pytest.mark.parametrize("kind", LINKED)
+def test_what_lies_in_a_folder_that_a_link_names_is_not_passed_over(kind, tmp_path):
+    name, reader = LINKED[kind]
+    for place in ("store/b", "raw/a"):
+        file = tmp_path / place / name.replace("1", "2" if place == "store/b" else "1")
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"x")
+        file.with_name("._" + file.name).write_bytes(b"x")
+    (tmp_path / "raw" / "more").symlink_to(tmp_path / "store")
+    assert len(reader(tmp_path / "raw").items()) == 2

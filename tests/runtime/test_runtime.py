@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -17,8 +18,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import Stopped, UsageError
-from dpcli.runtime import device, progress, provenance
+from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.runtime import device, pool, progress, provenance
 from dpcli.runtime.pool import LostWorker, ordered_map
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.signals import stop_requested
@@ -30,6 +31,15 @@ def square(x: int) -> int:
         raise ValueError("three")
     time.sleep(0.02 * (x % 3))  # later items finish first
     return x * x
+
+
+def test_a_machine_whose_processes_share_nothing_is_told_what_works(monkeypatch):
+    def no_place(*_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(pool, "ProcessPoolExecutor", no_place)
+    with pytest.raises(DpcError, match=r"/dev/shm \(Read-only file system\); --jobs 1 needs none"):
+        next(ordered_map(square, range(2), 2))
 
 
 def die_at_three(x: int) -> int:

@@ -208,6 +208,11 @@ _TOLD = {
 }
 
 
+_ASKS_A_DRIVER = [
+    name for name in dir(torch.optim.Optimizer) if name.endswith("_graph_capture_health_check")
+]  # CUDA builds
+
+
 def _enter_no_grad(self) -> None:
     self.instead = torch.no_grad()
     self.instead.__enter__()
@@ -234,6 +239,7 @@ def pretend_card() -> Iterator[None]:
             *((torch.cuda, name, told) for name, told in _TOLD.items()),
             (threading.Thread, "run", run),
             (torch, "save", save),
+            *((torch.optim.Optimizer, name, lambda self: None) for name in _ASKS_A_DRIVER),
             (torch.inference_mode, "__enter__", _enter_no_grad),  # its tensors have no version counter, shells need one
             (torch.inference_mode, "__exit__", _leave_no_grad),
         ):

@@ -121,7 +121,6 @@ def _target(wanted: str | int, predicted: int, sequence: CloudSequence) -> int:
 
 def channel_weights(layer: Layer) -> Tensor:
     """Returns Grad-CAM's weight of each channel (C): the mean over centroids of the class logit's gradient."""
-    assert layer.gradient is not None
     return layer.gradient.mean(0)
 
 

@@ -117,6 +117,11 @@ class KinetConfig:
         "Learn also from mirrored and time-reversed copies of a clip, each kind of them with a classifier of its own, and average"
         " their scores (backbone slots).",
     )
+    slot_details: bool = setting(
+        False,
+        "Classify also by quantiles of each slot of time, and by each slot at its place in the video, not by means and maxima over"
+        " all of them alone (backbone slots).",
+    )
     columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
     forest: tuple[int, int] = (
         0,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +16,8 @@ from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.mixed_precision import reduced_products, wanted
+from dpcli.runtime.run_folder import LossWatch
 
-_PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
 _RUNAWAY = 10  # times the loss of guessing
 
 
@@ -35,27 +34,10 @@ class _Logits(nn.Module):
         return self._logits[0](points, *groups)
 
 
-@dataclass
-class LossWatch:
-    """Says when a loss has run away: not finite for five steps on end, or on average far above the loss of guessing."""
-
-    classes: int
-    lost: int = 0
-    mean: float = field(default=math.nan)
-
-    def see(self, loss: float, stepped: bool) -> str | None:
-        """Takes the loss after each step; returns a sentence once it is time to stop. stepped: the gradient was finite."""
-        self.lost = 0 if stepped and math.isfinite(loss) else self.lost + 1
-        if self.lost >= _PATIENCE:
-            return f"no finite loss or gradient in {_PATIENCE} steps on end"
-        if math.isfinite(loss):
-            self.mean = loss if math.isnan(self.mean) else 0.95 * self.mean + 0.05 * loss
-        limit = _RUNAWAY * max(math.log(self.classes), 1)
-        return (
-            f"the loss grew to {self.mean:.3g}; guessing has {math.log(self.classes):.3g}"
-            if self.mean > limit
-            else None
-        )
+def watch_of(classes: int) -> LossWatch:
+    """Returns the watch over a classifier's loss, which runs away where it is on average far above that of guessing."""
+    guessing = math.log(classes)
+    return LossWatch(_RUNAWAY * max(guessing, 1), f"; guessing has {guessing:.3g}")
 
 
 class StageStep:

@@ -20,7 +20,7 @@ from dpcli.classify.training.epoch_batches import Batch, EpochBatches
 from dpcli.classify.training.fine_tune import freeze, train_mode
 from dpcli.classify.training.learning_rate_schedule import learning_rate
 from dpcli.classify.training.neighbor_cache import NeighborCache
-from dpcli.classify.training.optimizer_step import LossWatch, StageStep
+from dpcli.classify.training.optimizer_step import StageStep, watch_of
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.validation import validation_accuracy
 from dpcli.errors import DpcError
@@ -54,7 +54,7 @@ class Trainer:
         self.sums = [0.0, 0.0, 0.0]  # loss, correct, clips of the epoch so far
         self.spent = 0.0  # seconds of the epoch before a stop
         self.optimize: StageStep | None = None
-        self.watch = LossWatch(info.config.num_classes)
+        self.watch = watch_of(info.config.num_classes)
 
     def run(self) -> None:
         """Trains from wherever the folder's state says to the end of the dynamic stage; does nothing when it is there."""
@@ -76,7 +76,6 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Returns the validation videos' accuracy by stream, fused once both streams are trained."""
-        assert self.validation is not None
         static_only = (
             self.stage == 0 or not self.schedule.epochs_dynamic
         )  # the dynamic stream is not trained yet, or never
@@ -92,7 +91,7 @@ class Trainer:
         data = self._batches()
         if self.optimize is None:
             self.optimize = self._new_step(data)
-        self.watch = LossWatch(self.info.config.num_classes)
+        self.watch = watch_of(self.info.config.num_classes)
         clips = data.count * self.schedule.batch
         with Progress(f"train {STREAMS[self.stage]}", epochs * clips, "clip") as bar:
             bar.skip(self.epoch * clips + self.step * self.schedule.batch)
@@ -145,7 +144,6 @@ class Trainer:
 
     def _take(self, points: torch.Tensor, labels: torch.Tensor, clips: torch.Tensor, rate: float) -> bool:
         """Takes one step of all processes together; returns whether one of them was asked to stop."""
-        assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
         torch.manual_seed(torch_seed(*where))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)

@@ -30,7 +30,7 @@ class ArticulatedConversion(ConversionOptions):
 class ArticulationOptions:
     """Holds the options that say how an articulated object moves and how it is seen."""
 
-    HEADING: ClassVar = "Motion and view"
+    HEADING: ClassVar[str] = "Motion and view"
     frames: Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Frames per sequence.")] = 4
     view: Annotated[
         Literal["full", "single"],

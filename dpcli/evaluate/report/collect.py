@@ -14,6 +14,7 @@ from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.pipes import standard_input
+from dpcli.text_files import distinct_keys
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _EXPECTED = (
@@ -143,7 +144,7 @@ def _strict_json(text: str) -> Any:
         raise ValueError(f"{name} is no number")
 
     try:
-        return json.loads(text, parse_constant=refuse)
+        return json.loads(text, parse_constant=refuse, object_pairs_hook=distinct_keys)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 

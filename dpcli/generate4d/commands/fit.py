@@ -70,7 +70,7 @@ def fit_scene(
         )
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
-        scene = to_scene(model, targets, metrics)
+        scene = to_scene(model, targets, metrics, calm=shape is not None)
         _write(output, scene, targets, provenance.record(record, seed, {"views": path}), seed, force)
         if picture is not None:
             write_preview(scene, targets, picture)  # its parts are those of the file

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
+from dpcli.generate4d.scene.depth import calm_depth
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.scene.rigid_parts import find_parts, trust
 from dpcli.generate4d.targets import Targets
@@ -18,12 +19,13 @@ _SOLID = 0.1  # opacity of a Gaussian whose motion counts; fainter ones float an
 
 
 @torch.no_grad()
-def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
+def to_scene(model: Model4D, targets: Targets, metrics: dict, *, calm: bool = False) -> GaussianScene:
     """Returns every frame's Gaussians, their parts and how those move.
 
     Parts are found again on the whole motion, but where the settings leave the temporal cue out: those of its network
     then stand. A part's motion is the one that best explains where its Gaussians went (weighted Kabsch, weights part probability
-    times opacity), which is also what a fit without rigid motion can be asked for.
+    times opacity), which is also what a fit without rigid motion can be asked for. calm: motion along the reference
+    view's line of sight comes from layers that differ from frame to frame, and only its slow share is believed.
     """
     gaussians, control = model.gaussians, model.control
     motion = _motion_of_frames(model, targets)
@@ -31,6 +33,9 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     probability = motion["part"].mean(0)
     if model.config.rigid and model.config.temporal:
         probability = _found_parts(frame_mean, solid, targets, model.config.parts)
+    if calm:  # after the parts, whose number was chosen on the motion as fitted
+        pose = targets.world_to_camera[targets.reference]
+        frame_mean, motion["control"] = (calm_depth(places, pose) for places in (frame_mean, motion["control"]))
     return GaussianScene(
         mean=_array(gaussians.mean),
         log_scale=_array(gaussians.log_scale),

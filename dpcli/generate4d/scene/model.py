@@ -60,6 +60,14 @@ class Model4D(nn.Module):
         mean, turn = self.control.carry(own.mean, self.nearest, motion)
         return Instant(mean, turn_frames(turn, own.quaternion), motion, self.control.position)
 
+    def require_finite(self, instant: Instant) -> None:
+        """Raises FloatingPointError where a Gaussian can't be drawn at an instant: its numbers became NaN or infinite."""
+        own = self.gaussians
+        drawn = {"places": instant.mean, "turns": instant.quaternion, "sizes": own.log_scale.exp(), "colors": own.color}
+        for name, values in drawn.items():
+            if not values.detach().isfinite().all():
+                raise FloatingPointError(f"the Gaussians' {name} became NaN or infinite")
+
     def render(
         self, instant: Instant, viewmats: Tensor, intrinsics: Tensor, width: int, height: int, backgrounds: Tensor
     ) -> tuple[Tensor, Tensor, dict]:

@@ -18,6 +18,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.actions.depth_units import (
+    doubts_of_marks,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -30,6 +31,7 @@ from dpcli.prepare.decode.depth_files import (
     DepthVideo,
     frame_series,
     read_depth_video,
+    require_depth,
     says_depth,
 )
 from dpcli.prepare.decode.folder_listing import walk_folders
@@ -41,19 +43,20 @@ from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
 if TYPE_CHECKING:
-    from dpcli.prepare.decode.calibration import Calibration
+    from dpcli.prepare.decode.pinhole_camera import Calibration
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
-    r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|semantic|instance|segm|albedo|flow|image|photo"
+    r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
     r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
     re.IGNORECASE,
 )
 _FOREIGN = tuple(  # that may hold depth, and are not read
-    ".mat .h5 .hdf5 .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo .svo2 .r3d .sens .xef .klg .dat .pkl".split()
+    ".mat .h5 .hdf5 .gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
+    " .svo2 .r3d .sens .xef .klg .dat .pkl".split()
 )
 _HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
@@ -172,12 +175,15 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        video, recorded = self._video(item)
-        camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
-        scale = self._scale(video.frames.dtype)
+        series: Series | None = item.extra["series"]
+        require_depth(item.path, f"{item.name} {series.pattern if series else ''}")
+        video = self._video(item)
+        camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
+        scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
-        notes |= video.notes | (doubts_of_units(depth) if self._declared_scale is None else {})
+        notes |= video.notes | ({} if told else doubts_of_units(depth))
+        notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
@@ -186,23 +192,23 @@ class DepthVideos:
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
         points, counts = back_project(depth, camera, unit=unit, near=self.near, far=self.far)
-        require_plausible(str(item.path), points[:, 2], scale, asked=self._declared_scale is not None)
+        require_plausible(str(item.path), points[:, 2], scale, asked=told)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         sequence = CloudSequence(
             item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
         )
-        if item.extra["recording"] and not (recorded or self.calibration or self.intrinsics or self.fov):
-            notes[f"recordings without camera_info, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
+        if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
+            notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return Sample(sequence, {**notes, **dropped})
 
-    def _video(self, item: Item) -> tuple[DepthVideo, Calibration | None]:
-        """Returns the frames of an item, and the camera that a recording describes."""
+    def _video(self, item: Item) -> DepthVideo:
+        """Returns the frames of an item, with the camera that a recording describes."""
         if not item.extra["recording"]:
-            return read_depth_video(item.path, self.stride, item.extra["series"]), None
+            return read_depth_video(item.path, self.stride, item.extra["series"])
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
-        read, camera = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
+        read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -223,11 +229,15 @@ class DepthVideos:
         """Returns raw units per meter as the user or the calibration says them."""
         return self.depth_scale or (self.calibration.depth_scale if self.calibration else None)
 
-    def _scale(self, kind: np.dtype) -> float:
-        """Returns raw units per meter: the user's, the calibration's, or what is usual for the type of number."""
+    def _scale(self, video: DepthVideo) -> tuple[float, bool]:
+        """Returns raw units per meter (the user's, the calibration's, the recording's, or what is usual for the type of
+        number) and whether somebody said them.
+        """
+        kind = video.frames.dtype
         if self.calibration and not self.depth_scale and kind.kind != "f":
             self.calibration.require_clear_scale()
-        return self._declared_scale or usual_scale(kind)
+        told = self._declared_scale or (video.scale if kind.kind != "f" else None)
+        return told or usual_scale(kind), told is not None
 
     def _inverted(self, frames: np.ndarray, path: Path) -> np.ndarray:
         """Returns depth (T,H,W) as the sensor counts it, 0 = nothing seen."""
@@ -261,6 +271,7 @@ class DepthVideos:
         if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
+                " where a file tells none"
             )
         if self.calibration:
             lines += self.calibration.notes()

@@ -10,13 +10,14 @@ from dpcli.prepare.median import median
 _MARKS_16 = 65533  # this and more in 16 bits say that nothing was measured
 _MARKS_FLOAT = (65504.0, 65535.0)  # the largest half, and a mark of 16 bits that became a float
 _TOO_LARGE = 1e9  # raw floats beyond are marks, whatever the unit
-_PLAUSIBLE = (0.005, 200.0)  # meters that depth cameras see, typically
+_PLAUSIBLE = (0.005, 100.0)  # meters that depth cameras see, typically
 _PLAUSIBLE_IF_ASKED = (0.005, 1000.0)  # where the user gave the units
 _SAMPLED = 4096
 _ROUGH, _SMOOTHER = 0.01, 8.0  # how much neighbors differ, as a share of the mean; how much less with bytes swapped
 _STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per meter, of a sensor's millimeters
 _SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
 _MARKED, _WELL_BELOW = 0.005, 0.97  # share of pixels that hold a mark; up to where the others reach then
+_FAR_BELOW = 0.25  # up to where they reach where the mark is no largest number of some bits
 _ROWS = 16  # of a frame that are looked at
 
 
@@ -79,17 +80,12 @@ def _roughness(rows: np.ndarray) -> float:
 
 def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
-    in millimeters; the low bits of 8 may hold flags. Another one where the largest number of 10 to 15 bits seems to be a mark.
+    in millimeters; the low bits of 8 may hold flags.
     """
     if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
         return {}
-    flat = frames[len(frames) // 2].reshape(-1)
-    some = flat[:: max(1, len(flat) // _SAMPLED)].astype(np.int64)
-    some = some[some > 0]
-    if mark := _full_bits(some):
-        what = f"videos in which many pixels hold {mark}, the largest number of {mark.bit_length()} bits, and none a little less"
-        return {f"{what}: a mark of nothing seen? --far leaves them out": 1}
-    if _kinds(some) <= _KINDS:
+    some = _some_depths(frames)
+    if _mark(some) or _kinds(some) <= _KINDS:
         return {}
     for step, scale in _STEPS.items():
         alike, coarser = (np.bincount(some % own).max() > _SAME_REST * len(some) for own in (step, 2 * step))
@@ -99,22 +95,36 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     return {}
 
 
+def doubts_of_marks(frames: np.ndarray) -> dict[str, int]:
+    """Returns a note when the largest number of raw depths (T,H,W) seems to mark that nothing was seen."""
+    mark = _mark(_some_depths(frames))
+    what = f"videos in which many pixels hold {mark:g}, their largest number, and none a little less"
+    return {f"{what}: a mark of nothing seen? --far leaves them out": 1} if mark else {}
+
+
+def _some_depths(frames: np.ndarray) -> np.ndarray:
+    """Returns some raw depths above 0 of the middle one of frames (T,H,W)."""
+    flat = frames[len(frames) // 2].reshape(-1)
+    some = flat[:: max(1, len(flat) // _SAMPLED)]
+    return some[some > 0]
+
+
 def _kinds(values: np.ndarray) -> int:
     """Returns how many different numbers there are; `np.unique` loads masked arrays first, for which every process would wait."""
     ordered = np.sort(values, axis=None)
     return np.count_nonzero(ordered[1:] != ordered[:-1]) + min(len(ordered), 1)
 
 
-def _full_bits(values: np.ndarray) -> int:
-    """Returns the largest of some raw depths, i64 (N), if it is all that 10 to 15 bits can hold, several have it, and the
-    others end well below; else 0.
+def _mark(values: np.ndarray) -> float:
+    """Returns the largest of some raw depths (N) if several have it and the others end far below, or well below where it is
+    all that 8 or 10 to 15 bits can hold; else 0.
     """
-    most = int(values.max(initial=0))
-    if most + 1 not in [1 << bits for bits in range(10, 16)]:
-        return 0
+    most = float(values.max(initial=0))
     others = values[values < most]
     several = len(values) - len(others) > _MARKED * len(values)
-    return most if several and int(others.max(initial=0)) < _WELL_BELOW * most else 0
+    bits = (8 if values.itemsize == 1 else None, *range(10, 16))
+    full = values.dtype.kind != "f" and most + 1 in [1 << own for own in bits if own]
+    return most if several and 0 < float(others.max(initial=0)) < (_WELL_BELOW if full else _FAR_BELOW) * most else 0.0
 
 
 def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: bool) -> None:
@@ -129,7 +139,7 @@ def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: boo
     if least <= typical <= most:
         return
     raw = typical * scale
-    better = next((own for own in (1 / scale, 1000.0, 1.0, 10_000.0) if 0.1 <= raw / own <= 100.0), None)
+    better = next((own for own in (1 / scale, 1000.0, 1.0, 10_000.0, 100.0) if 0.2 <= raw / own <= 100.0), None)
     hint = (
         f"did you mean --depth-scale {better:.6g}, which makes it {raw / better:.3g} m?"
         if better

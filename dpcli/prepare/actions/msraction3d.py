@@ -13,6 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import first_names
 from dpcli.prepare.actions.mat5 import read_mat5
+from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
@@ -147,7 +148,7 @@ class MSRAction3D:
         expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
         folder = require_folder(self.raw, expected)
         found: dict[str, Item] = {}
-        for path in sorted(folder.rglob("*"), key=lambda p: (p.name.lower(), str(p))):
+        for path in sorted(files_below(folder), key=lambda p: (p.name.lower(), str(p))):
             match = NAME.fullmatch(path.name)
             # .bin sorts before .mat: where both are present the official form wins
             if match and path.name[:11].lower() not in found:

@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions import msraction3d, ntu60
 from dpcli.prepare.actions.pts_label import FILE as PTS_LABEL
 from dpcli.prepare.actions.pts_label import PtsLabel
-from dpcli.prepare.decode.folder_listing import leads_out
+from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
 from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
@@ -54,7 +54,7 @@ def open_preprocessed(
 
 def _detect(raw: Path) -> str:
     expected = f"{PTS_LABEL}, aAA_sSS_eEE_sdepth.npz or SsssCcccPpppRrrrAaaa.npz files"
-    for path in sorted(require_folder(raw, expected).rglob("*.np[yz]")):
+    for path in files_below(require_folder(raw, expected)):
         if path.name == PTS_LABEL:
             return "pts_label"
         for form, name in (("msraction3d", _MSR), ("ntu60", _NTU)):
@@ -110,7 +110,7 @@ class PeerClouds:
         root = require_folder(self.raw, f"one .npz per video of {self.form}")
         make: Callable[[Path], Item] = self._msr_item if self.form == "msraction3d" else self._ntu_item
         items: dict[str, Item] = {}
-        for path in sorted(root.rglob("*.npz")):
+        for path in (path for path in files_below(root) if path.suffix == ".npz"):
             item = make(path)
             if target := leads_out(path, root):
                 item = Item(item.name, path, problem=f"{path}: a link that leads out of the data, to {target}")

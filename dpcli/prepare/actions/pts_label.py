@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +15,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
-from dpcli.prepare.decode.folder_listing import leads_out
+from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
 from dpcli.store import CloudSequence
 
@@ -85,7 +86,8 @@ class PtsLabel:
             return []
 
     def _is_nvgesture(self) -> bool:
-        return any(True for _ in self.raw.rglob("class_*")) and not any(True for _ in self.raw.rglob("gesture_*"))
+        names = {name for path in files_below(self.raw) for name in path.relative_to(self.raw).parts}
+        return any(fnmatch(name, "class_*") for name in names) and not any(fnmatch(name, "gesture_*") for name in names)
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
@@ -93,7 +95,7 @@ class PtsLabel:
         lists = self._list_files()
         listed = {e.folder: (s, e) for s, _, e in entries(lists) if isinstance(e, Entry)}
         items: dict[str, Item] = {}
-        for path in sorted(root.rglob(FILE)):
+        for path in [path for path in files_below(root) if path.name == FILE]:
             item = self._item(path, root, listed)
             if item.name in items:
                 problem = f"{path}: {item.name} is there twice; {items[item.name].path} is read"

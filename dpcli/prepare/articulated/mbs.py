@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import open_archive
 from dpcli.prepare.decode.safe_pickle import read_npz_member
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
@@ -49,7 +50,7 @@ def most_parts(raw: Path) -> int:
 
 
 def _segmentation(path: Path) -> np.ndarray:
-    with zipfile.ZipFile(path) as archive:
+    with open_archive(path) as archive:
         return read_npz_member(archive, path, "segm")
 
 
@@ -61,7 +62,7 @@ def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     DataError names the array that is not as it should be.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             points = read_npz_member(archive, path, "pc")
             segm = read_npz_member(archive, path, "segm")
             trans = read_npz_member(archive, path, "trans", pickled=True)
@@ -137,11 +138,8 @@ class MultiBodySync:
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         points, part, poses = read_views(item.path)
-        missing = item.extra["parts"] - poses.shape[1]
-        padding = np.tile(np.eye(4), (len(poses), missing, 1, 1))
-        sequence = CloudSequence.from_frames(
-            item.name, list(points), part=list(part), pose=np.concatenate([poses, padding], axis=1), **describe(item)
-        )
+        sequence = CloudSequence.from_frames(item.name, list(points), part=list(part), pose=poses, **describe(item))
+        sequence.pad_parts(item.extra["parts"])
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:

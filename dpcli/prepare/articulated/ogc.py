@@ -168,10 +168,9 @@ class OgcRooms:
         used, padded = 1 + max(int(part.max()) for part in parts), item.extra["parts"]
         if used > padded:
             raise DataError(f"{item.path}: background in a later frame, but in no first frame of any room")
-        poses = poses[:, :padded]
-        filling = np.tile(np.eye(4), (len(poses), padded - poses.shape[1], 1, 1))
-        pose = np.concatenate([poses, filling], axis=1)
-        return Sample(CloudSequence.from_frames(item.name, clouds, part=parts, pose=pose, **describe(item)))
+        sequence = CloudSequence.from_frames(item.name, clouds, part=parts, pose=poses[:, :padded], **describe(item))
+        sequence.pad_parts(padded)
+        return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

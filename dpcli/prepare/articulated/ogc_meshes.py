@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
+from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.meshes.mesh_files import load_mesh
 from dpcli.prepare.reader import natural_key, require_folder
 
@@ -29,12 +29,7 @@ class Shape:
 def find_meshes(folder: Path) -> tuple[str, ...]:
     """Returns mesh files below a folder, relative to it, in natural order. Raises DataError when there are none."""
     require_folder(folder, f"meshes in it or below ({' '.join(MESH_FORMATS)})")
-    found = [
-        Path(root, name).relative_to(folder).as_posix()
-        for root, _, names in os.walk(folder)
-        for name in names
-        if Path(name).suffix.lower() in MESH_FORMATS
-    ]
+    found = [path.relative_to(folder).as_posix() for path in files_below(folder) if path.suffix.lower() in MESH_FORMATS]
     if not found:
         raise DataError(f"{folder}: no meshes in it or below; expected {' '.join(MESH_FORMATS)}")
     return tuple(sorted(found, key=natural_key))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -17,6 +16,7 @@ from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, 
 from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
@@ -56,10 +56,10 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
 
 def _urdf_files(raw: Path) -> list[Path]:
     files = []
-    for folder, below, names in os.walk(raw):
+    for folder, below, names in walk_folders(raw):
         urdf = sorted(name for name in names if name.lower().endswith(".urdf") and not name.startswith("."))
         files += [Path(folder, name) for name in (["mobility.urdf"] if "mobility.urdf" in urdf else urdf)]
-        below[:] = sorted(name for name in below if not name.startswith("."))
+        below.sort()
     return files
 
 
@@ -163,7 +163,7 @@ class Sapien:
         counts = Counter(good.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
         names = f" of {len(self.class_names)} categories" if self.class_names else ""
-        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"]
+        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"] if good else []
 
 
 def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:

@@ -19,7 +19,10 @@ from dpcli.runtime.clips.other_files import refuse_wrapped
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
+_TYPES = (*MOVABLE, "fixed", *_UNSUPPORTED)
 _TURNS = "hinges with limits more than two turns apart (one turn taken; are they degrees? a URDF has radians)"
+_DEGREES = "origins turned by more than one turn (are they degrees? a URDF has radians)"
+_LARGEST = 1e9  # of all numbers but limits, which may be as large as a float for none
 _EQUAL = "joints whose two limits are equal taken as fixed (as SolidWorks exports joints without limits)"
 
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
@@ -61,9 +64,9 @@ def read_skeleton(path: Path, root: Path | None = None) -> Skeleton:
     a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
     root: its meshes must lie in it.
     """
-    robot = _parse(path)
-    _check_names(path, robot)
     notes: Counter = Counter()
+    robot = _parse(path, notes)
+    _check_names(path, robot)
     order, place = _walk_tree(path, robot)
     joints, sources = _movable(path, order, place, notes)
     return Skeleton(path, _followers(path, robot, joints, sources), _shapes(robot, place, notes), notes, root)
@@ -95,8 +98,8 @@ def missing_meshes(skeleton: Skeleton) -> list[str]:
     return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name, skeleton.root).is_file()]
 
 
-def _parse(path: Path) -> Any:
-    """Returns the robot of yourdfpy; cylinders that are ``round`` are capsules.
+def _parse(path: Path, notes: Counter) -> Any:
+    """Returns the robot of yourdfpy; cylinders that are ``round`` are capsules. What is odd is counted in ``notes``.
 
     Raises DataError when the file is not a URDF, or is a xacro.
     """
@@ -113,6 +116,8 @@ def _parse(path: Path) -> Any:
     try:
         tree = etree.parse(BytesIO(text), etree.XMLParser(resolve_entities=False, no_network=True))
         _make_plain(path, tree)
+        turned = [origin for origin in tree.iter("origin") if _turns_over(origin.get("rpy", ""))]
+        notes.update({_DEGREES: len(turned)} if turned else {})
         capsules = _capsules(tree.getroot())
         robot = URDF.load(BytesIO(etree.tostring(tree)), build_scene_graph=False, load_meshes=False).robot
         for link, kind, number in capsules:
@@ -182,6 +187,9 @@ def _remove_unread(root: Any) -> None:
                 inner.tag not in _READ[element.tag] or drawn and inner.tag == "collision"
             ):
                 element.remove(inner)
+    for still in root.iterfind("joint[@type='fixed']"):
+        for unread in [*still.findall("axis"), *still.findall("limit")]:
+            still.remove(unread)
     for limit in root.iter("limit"):
         for name in {*limit.attrib} - {"lower", "upper"}:
             del limit.attrib[name]
@@ -197,19 +205,31 @@ def _check_texts(path: Path, root: Any) -> None:
             if not text.strip():
                 del element.attrib[name]
             elif len(text.split()) not in expected or not all(map(_is_number, text.split())):
-                owner = next(one for one in element.iterancestors() if one.tag in ("link", "joint", "robot"))
                 raise DataError(
-                    f"{path}: {owner.tag} {owner.get('name')!r}: {name}={text!r} of <{element.tag}>; expected "
+                    f"{path}: {_owner(element)}: {name}={text!r} of <{element.tag}>; expected "
                     f"{' or '.join(map(str, expected))} {'number' if expected == (1,) else 'numbers'}, with spaces between"
+                )
+            elif element.tag != "limit" and not max(abs(float(word)) for word in text.split()) <= _LARGEST:
+                raise DataError(
+                    f"{path}: {_owner(element)}: {name}={text!r} of <{element.tag}>; no robot is that large (meters, radians)"
                 )
 
 
+def _owner(element: Any) -> str:
+    owner = next(one for one in element.iterancestors() if one.tag in ("link", "joint", "robot"))
+    return f"{owner.tag} {owner.get('name')!r}"
+
+
 def _is_number(text: str) -> bool:
+    """Returns whether a text is a number; infinite limits are none at all, but nan means nothing."""
     try:
-        float(text)
+        return not np.isnan(float(text))
     except ValueError:
         return False
-    return True
+
+
+def _turns_over(angles: str) -> bool:
+    return any(abs(float(word)) > 2 * np.pi + 1e-2 for word in angles.split())
 
 
 def _roll_pitch_yaw(path: Path, text: str) -> list[float]:
@@ -344,7 +364,7 @@ def _movable(
         if joint.type in _UNSUPPORTED:
             notes[f"{joint.type} joints taken as fixed"] += 1
         elif joint.type not in (*MOVABLE, "fixed"):
-            raise DataError(f"{path}: joint {joint.name!r} has the type {joint.type!r}; expected {', '.join(MOVABLE)}")
+            raise DataError(f"{path}: joint {joint.name!r} has the type {joint.type!r}; expected {', '.join(_TYPES)}")
         if not _moves(joint):
             if joint.type in MOVABLE:
                 notes[_EQUAL] += 1

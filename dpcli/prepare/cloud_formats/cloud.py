@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
+_TINY = 1e-36  # below it and above its inverse lie no numbers but those whose bytes mean something else
 AT_ORIGIN = "points at (0,0,0) dropped"
 _WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
 MOST_UNNAMED = 40  # columns; a picture has more
@@ -68,6 +69,7 @@ def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequen
         color = np.stack([columns[names[place]] for place in colors], axis=1)
     elif colors:
         color = unpack_rgb(columns[names[colors[0]]])
+        colors = colors if color is not None else []
     used = tuple(names[place] for place in (*axes[0], *colors))
     return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used, without(names, used, keep))
 
@@ -142,8 +144,11 @@ def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
 
 def unpack_rgb(packed: np.ndarray) -> np.ndarray | None:
     """Returns colors u8 (N,3) of numbers 0xRRGGBB (or 0xAARRGGBB): whole ones, or float32 whose bytes hold them, as PCL
-    has them; None of anything else.
+    has them, in texts, too; None of anything else.
     """
+    sizes = np.abs(packed[packed != 0]) if packed.dtype == np.float64 else packed[:0]
+    if len(sizes) and ((sizes < _TINY) | (sizes > 1 / _TINY)).all():
+        packed = packed.astype(np.float32)
     if packed.dtype.kind == "f" and packed.dtype.itemsize == 4:
         packed = np.ascontiguousarray(packed).view(np.uint32)
     elif packed.dtype.kind == "f" and (packed != np.floor(packed)).any():

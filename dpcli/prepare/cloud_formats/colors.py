@@ -9,7 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 
 _BYTE, _WORD = 255, 65535
-_ABOUT_ONE, _SURELY_BYTES = 1.001, 2.0  # fractions may be rounded; from the second on fractions of bytes are bytes
+_ABOUT_ONE, _SURELY_BYTES = 1.001, 16.0  # fractions may be rounded; from the second on fractions of bytes are bytes
 _SURELY_WORDS = 1023  # numbers without a type that are less above 255 are an error in the file
 
 
@@ -32,6 +32,8 @@ def as_bytes(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
         return [np.rint(np.minimum(frame.astype(np.float64), 1) * _BYTE).astype(np.uint8) for frame in frames]
     if floats and high < _SURELY_BYTES and any((frame != np.floor(frame)).any() for frame in filled):
         raise _unknown(low, high)  # brighter than white, or bytes of a scene that is nearly black
+    if floats and any(frame.max() <= _ABOUT_ONE and (frame != np.floor(frame)).any() for frame in filled):
+        raise DataError(f"colors from 0 to 1 in some frames and to {high:g} in others; expected one range")
     if high <= _BYTE:
         return [np.rint(frame).astype(np.uint8) for frame in frames]
     if kinds <= {np.dtype(np.uint16)} or high > _SURELY_WORDS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from dpcli.errors import DataError
 
@@ -30,6 +30,9 @@ _ABOUT_COLORS = frozenset(
 _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height", "altitude", "z"))
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")
+_TOLD = re.compile(
+    r"\b(?:unit|units|coordinates|lengths)\b(?:\s*[:=]\s*|\s+(?:are\s+|is\s+)?(?:in\s+)?)([a-z]+)\b", re.IGNORECASE
+)
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
 _FRAME = re.compile(
     r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq|#|№)?[.]?",
@@ -46,6 +49,7 @@ def words_of(name: str) -> list[str]:
     (['x', 'um'], ['höhe'])
     """
     plain = re.sub("[\u00b5\u03bc]", "u", name)  # two letters look like a micro sign
+    plain = re.sub(r"""[\[(]("|''|\u2033)[\])]""", "(inch)", plain)
     return [word.lower() for word in _WORD.findall(plain)]
 
 
@@ -79,6 +83,16 @@ def unit_of(name: str) -> str:
     if re.search(r"[\[(]in[\])]$", name.strip()):  # without brackets a word like others
         return "in"
     return _SPELLED.get(words[-1], "") if len(words) > 1 else ""
+
+
+def unit_of_comments(lines: Iterable[str]) -> str:
+    """Returns the unit that comments of a file's header tell, "" where they tell none, or several.
+
+    >>> unit_of_comments(["comment made by hand", "obj_info units = mm"]), unit_of_comments(["# unit: none"])
+    ('mm', '')
+    """
+    told = {_SPELLED.get(match[1].lower(), "") for line in lines if (match := _TOLD.search(line))} - {""}
+    return told.pop() if len(told) == 1 else ""
 
 
 def _one_unit(units: set[str]) -> str:
@@ -123,7 +137,9 @@ def _numbered_axes(names: Sequence[str]) -> list[int | None]:
 
 def find_colors(names: Sequence[str]) -> list[int]:
     """Returns the places of red, green and blue among the names, or of the one that holds all three; [] without."""
-    plain = [[word for word in words_of(name) if word not in _ABOUT_COLORS] for name in names]
+    plain = [
+        [word for word in words_of(name) if word not in _ABOUT_COLORS] if "%" not in name else [] for name in names
+    ]
     for trio in _COLORS:
         places = [[place for place, words in enumerate(plain) if words == [color]] for color in trio]
         if all(places):

@@ -27,6 +27,7 @@ _MODEL_KEY, _UNIT_KEY, _HEIGHT_UNIT_KEY = 1024, 3076, 4099  # of GeoTIFF: kind o
 _GEOGRAPHIC = 2  # the model of longitudes and latitudes
 _SIZES = struct.Struct("<HII")  # at byte 94: of the header, where the points begin, how many records lie between
 _RECORD, _LATE_RECORD = 54, 60  # bytes at least of a record before the points, and of one behind them
+_FINE = 1e-6  # of degrees a decimeter
 _FINEST, _COARSEST = 1e-15, 1e15  # of a number of the file, in units of length
 _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
@@ -56,6 +57,8 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     unread = without(names, "XYZ", _COLORS, _ABOUT_RETURNS, keep)
     unit, heights = _units(path, las)
     points = _scaled(las)
+    if not unit and _seem_degrees(las.header.scales, points):
+        raise DataError(_in_degrees(path))
     if heights != unit:  # such as survey feet on the map and meters above sea
         points[:, 2] *= UNITS[heights] / UNITS[unit]
     cloud = Cloud(points, color, unit, extra, unread=unread, dropped=require_points(path, len(points), room))
@@ -66,11 +69,24 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     return cloud
 
 
+def _in_degrees(path: Path) -> str:
+    return (
+        f"{path}: its coordinates are longitudes and latitudes in degrees; expected lengths: project them first, such as to"
+        " UTM"
+    )
+
+
 def _check_scales(path: Path, scales: np.ndarray) -> None:
     """Raises DataError for a scale that no coordinate has: 0 puts all points into one plane, without a word."""
     for axis, scale in zip("xyz", scales):
         if not _FINEST < abs(scale) < _COARSEST:
             raise DataError(f"{path}: damaged: its header scales {axis} by {scale:g}; expected such as 0.001")
+
+
+def _seem_degrees(scales: np.ndarray, points: np.ndarray) -> bool:
+    """Returns whether x and y are stored far more finely than heights, and are what longitudes and latitudes can be."""
+    fine = max(scales[:2]) <= _FINE and scales[2] > 100 * max(scales[:2])
+    return bool(fine and len(points) and (np.abs(points[:, :2]).max(0) <= (180, 90)).all())
 
 
 def _load_laspy() -> ModuleType:
@@ -145,10 +161,7 @@ def _units(path: Path, las: Any) -> tuple[str, str]:
         text = getattr(record, "string", "")
         keys = {key.id: key.value_offset for key in getattr(record, "geo_keys", []) if key.tiff_tag_location == 0}
         if _is_geographic(text) or keys.get(_MODEL_KEY) == _GEOGRAPHIC:
-            raise DataError(
-                f"{path}: its coordinates are longitudes and latitudes in degrees; expected lengths: project them first,"
-                " such as to UTM"
-            )
+            raise DataError(_in_degrees(path))
         found = (
             units_of_wkt(text) if text else [_GEO_UNITS.get(keys.get(key), "") for key in (_UNIT_KEY, _HEIGHT_UNIT_KEY)]
         )

@@ -19,6 +19,8 @@ _CELL = 8  # bytes of a number
 class ParquetTable:
     """Offers a Parquet or Feather file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words."""
 
+    unit = ""  # of the coordinates, which no comments tell here
+
     def __init__(self, path: Path) -> None:
         try:
             import pyarrow.parquet as parquet

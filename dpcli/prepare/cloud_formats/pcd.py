@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, require_points
+from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.cloud_formats.text_numbers import TextTable
 
 _DATA = ("ascii", "binary", "binary_compressed")
@@ -23,7 +24,7 @@ POSED = "frames with a sensor pose (VIEWPOINT of PCD), which is not applied: poi
 class Header:
     """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data.
 
-    posed: whether it tells where the sensor stood, other than at the origin of the points.
+    posed: whether it tells where the sensor stood, other than at the origin of the points. unit: as comments tell it.
     """
 
     kind: np.dtype
@@ -32,6 +33,7 @@ class Header:
     length: int
     lines: int
     posed: bool = False
+    unit: str = ""
 
 
 def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -50,26 +52,30 @@ def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
         columns = _read_compressed(path, body, header)
     shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
     posed = {POSED: 1} if header.posed else {}
-    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed)
+    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed, unit=header.unit)
 
 
 def _read_header(path: Path, data: bytes) -> Header:
     said: dict[str, list[str]] = {}
     start = 3 if data.startswith(b"\xef\xbb\xbf") else 0
-    lines = 0
+    lines, comments = 0, []
     while "DATA" not in said:
         end = data.find(b"\n", start, start + 65536)
         if end < 0 or lines > 100:
             raise DataError(f"{path}: not a PCD point cloud: no number of points in its header")
-        words = data[start:end].decode("latin-1").split()
-        if words and not words[0].startswith("#"):
+        line = data[start:end].decode("latin-1").strip()
+        words = line.split()
+        if line.startswith("#"):
+            comments.append(line)
+        elif words:
             said[words[0].upper()] = words[1:]
         start, lines = end + 1, lines + 1
     points = _points(path, said)
     form = said["DATA"][0].lower() if said["DATA"] else ""
     if form not in _DATA:
         raise DataError(f"{path}: DATA {form}; expected {', '.join(_DATA)}")
-    return Header(_row_type(path, said), points, form, start, lines, _posed(said.get("VIEWPOINT", [])))
+    posed, unit = _posed(said.get("VIEWPOINT", [])), unit_of_comments(comments)
+    return Header(_row_type(path, said), points, form, start, lines, posed, unit)
 
 
 def _points(path: Path, said: dict[str, list[str]]) -> int:

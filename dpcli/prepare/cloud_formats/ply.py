@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, require_points
+from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.cloud_formats.text_numbers import TextTable
 
 _TYPES = {
@@ -51,12 +52,13 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the vertices. Raises DataError when they end early, or hold what their types can't."""
     with path.open("rb") as file:
         order, elements = read_header(path, file)
+        unit = _unit(file)
         place = next((k for k, element in enumerate(elements) if element.name in ("vertex", "point")), None)
         if place is None:
             raise DataError(f"{path}: no element vertex in its header; expected a point cloud or a mesh")
         vertex, before, behind = elements[place], elements[:place], elements[place + 1 :]
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
-            return cloud_of_columns(path, _read_with_lists(path, vertex), keep)
+            return replace(cloud_of_columns(path, _read_with_lists(path, vertex), keep), unit=unit)
         if order:
             columns, rest = _read_binary(path, file, order, vertex, before)
         else:
@@ -64,7 +66,7 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
         if order and behind:
             _require_elements(path, file, order, behind)
             rest = {}
-    return replace(cloud_of_columns(path, columns, keep), dropped=rest)
+    return replace(cloud_of_columns(path, columns, keep), dropped=rest, unit=unit)
 
 
 def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
@@ -95,6 +97,14 @@ def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
         )
     file.seek(after)
     return order, elements
+
+
+def _unit(file: BinaryIO) -> str:
+    """Returns the unit that comments of the header tell, which ends where the file stands."""
+    end = file.tell()
+    file.seek(0)
+    lines = file.read(end).decode("latin-1").splitlines()
+    return unit_of_comments([line for line in lines if line.startswith(("comment", "obj_info"))])
 
 
 def _property_type(path: Path, words: list[str]) -> str:

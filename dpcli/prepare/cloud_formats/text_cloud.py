@@ -62,7 +62,8 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
         first = _first_axis(table, values)
         counted = ("column 1 (no name, numbers of the rows)",) if first else ()
-        return Cloud(values[:, first : first + 3], unread=counted + unnamed_columns(first + 4, table.width))
+        unread = counted + unnamed_columns(first + 4, table.width)
+        return Cloud(values[:, first : first + 3], unit=table.unit, unread=unread)
     axes = named_axes(table.path, table.names)
     if axes is None:
         raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
@@ -70,7 +71,8 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     places = list(dict.fromkeys(places))
     values = table.columns(places)
     cloud = cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
-    return replace(cloud, unread=without([name for name in table.names if name], cloud.columns, keep))
+    unread = without([name for name in table.names if name], cloud.columns, keep)
+    return replace(cloud, unread=unread, unit=cloud.unit or table.unit)
 
 
 def _first_axis(table: TextTable, values: np.ndarray) -> int:

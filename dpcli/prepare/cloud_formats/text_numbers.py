@@ -15,7 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
-from dpcli.prepare.cloud_formats.column_names import unit_of
+from dpcli.prepare.cloud_formats.column_names import unit_of, unit_of_comments
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 
 _MARKS = (
@@ -32,7 +32,7 @@ _MISSING = frozenset(
 )
 _NOT_A_NUMBER = re.compile(r"[-+]?1[.,]#(qnan|snan|ind|inf)\w*", re.IGNORECASE)  # as Windows writes it
 _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
-_GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
+_GROUPED = re.compile(r"[-+]?\d{1,3}([.,'\u2019 \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
 _FRACTION = re.compile(r"[-+]?\d+\.\d+")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 _SPACED_COMMAS = re.compile(r"[-+]?\d+,\d+(, +[-+]?\d+,\d+)+")
@@ -49,6 +49,7 @@ class TextTable:
 
     body: the text from the first row on; first_line: which line of the file that is, from 1. delimiter: None for blanks.
     limit: rows that count, None for all. header: the line of the names, which files that were joined hold several times.
+    unit: of the coordinates, as comments before the rows tell it.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class TextTable:
     delimiter: str | None = None
     limit: int | None = None
     header: str = ""
+    unit: str = ""
 
     @cached_property
     def numbered(self) -> list[tuple[int, str]]:
@@ -259,7 +261,8 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
     first, names = _find_header(path, head, delimiter)
     body = text.split("\n", first - 1)[-1] if first > 1 else text
     header = next((line for k, line in head if k == first - 1), "") if names else ""
-    table = _with_units(TextTable(path, tuple(names), body, first, delimiter, header=header))
+    unit = unit_of_comments([line for k, line in head if k < first and line.startswith(COMMENTS)])
+    table = _with_units(TextTable(path, tuple(names), body, first, delimiter, header=header, unit=unit))
     rows = table.first_rows(2)
     if not rows and names and may_be_empty:
         return table

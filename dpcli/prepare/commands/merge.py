@@ -96,6 +96,7 @@ def _merge_unlike(
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     unit = sources[0].length_unit
     pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
+    pattern.parts = max(source.parts for source in sources)
     copy = Copy(
         output=output,
         pattern=pattern,
@@ -143,10 +144,11 @@ def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) ->
 
 
 def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
-    """Returns the sample as the joined file has it: its label, its name, and no field that others lack."""
+    """Returns the sample as the joined file has it: its label, its name, as many parts, and no field that others lack."""
     if label is not None:
         sequence.label = label
     sequence.name = source.prefix + sequence.name
     for name in set(source.fields) - set(pattern.fields):
         sequence.without(name)
+    sequence.pad_parts(pattern.parts)
     return sequence

@@ -11,6 +11,7 @@ from dpcli.errors import DataError
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.file import file_kind, read_positions
+from dpcli.store.sequence import OF_PARTS
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
@@ -20,7 +21,8 @@ class Source:
     """Holds what the index of one file says; its points stay on the disk.
 
     made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped,
-    where the file is a shard. prefix: what goes before its samples' names in the joined file.
+    where the file is a shard. parts: of how many its poses and joints speak. prefix: what goes before its samples'
+    names in the joined file.
     """
 
     path: Path
@@ -35,6 +37,7 @@ class Source:
     skipped: list[tuple[str, str]] = field(default_factory=list)
     positions: tuple[list[int], list[int]] | None = None
     shard: Shard | None = None
+    parts: int = 0
     prefix: str = ""
 
     def sample_name(self, index: int) -> str:
@@ -64,6 +67,9 @@ def read_source(path: Path) -> Source:
             skipped=reader.skipped,
             positions=read_positions(reader.file),
             shard=found[0] if found else None,
+            parts=max(
+                (n for key in OF_PARTS.keys() & set(reader.fields) for n in reader.file[key].shape[1:2]), default=0
+            ),
         )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.text_files import check_depth, parse_json
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
@@ -24,20 +23,15 @@ _CX = ("cx", "ppx", "c_x", "mx_depth")
 _CY = ("cy", "ppy", "c_y", "my_depth")
 _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
 _MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
-_WIDTH = ("width", "w", "image_width", "depthwidth", "m_depthwidth")
-_HEIGHT = ("height", "h", "image_height", "depthheight", "m_depthheight")
-_SCALE = (
-    "depth_scale",
-    "depthmapfactor",
-    "depthscale",
-    "depth_factor",
-    "depth_units",
-    "depth_unit",
-    "png_depth_scale",
-    "depth_shift",
-    "integer_depth_scale",
-    "depth_unit_scale_factor",
-    "m_depthshift",
+_SIZE_OF = (
+    "^(m|camera|cam|sensor)?(depth|ir|image|img|picture|frame|resolution|{})*"  # and before the names of both sides
+)
+_SIDES = ("(width|w|cols|columns)$", "(height|h|rows)$")
+_SIZE = re.compile("^(depth|image|img|frame|picture|camera)*(size|resolution|dimensions?|shape)$")
+_ASPECT = 1.5  # of the focal lengths, beyond which other numbers are meant
+_SCALE = re.compile(  # a key of the depth scale without what is no letter, and the unit that it may end with
+    r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
+    r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
 )
 _LENS = (
     "coeffs",
@@ -53,8 +47,7 @@ _TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenC
 _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
-_AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
-_ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
+_ABOUT_CAMERAS = "distortions?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
 _MOST_NUMBERS = 64  # in an array
 _MOST_PIXELS = 1_000_000  # of a side of a picture
@@ -62,60 +55,6 @@ _EXPECTED = (
     'expected {"fx": .., "fy": .., "cx": .., "cy": ..} in pixels, a 3x3 or 4x4 matrix, or what RealSense, Open3D, ROS or'
     " COLMAP write"
 )
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
-
-    intrinsics: Intrinsics
-    width: int = 0
-    height: int = 0
-    depth_scale: float | None = None
-    source: str = "the options"
-
-    def of_pictures(self, width: int, height: int) -> Intrinsics:
-        """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
-
-        Raises DataError when they are of another shape, or when the principal point lies outside of the pictures.
-        """
-        own, found = f"{self.width}x{self.height}", f"{width}x{height}"
-        camera = self.intrinsics
-        if self.width and self.height and (self.width, self.height) != (width, height):
-            x, y = width / self.width, height / self.height
-            if abs(x / y - 1) > _ASPECT:
-                raise DataError(
-                    f"{self.source}: is of {own} pictures, these have {found}, which is another shape; expected the"
-                    " calibration of the depth camera itself"
-                )
-            middle = ((camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
-            camera = replace(camera, fx=camera.fx * x, fy=camera.fy * y, cx=middle[0], cy=middle[1])
-        if 0 < camera.cx <= 1 and 0 < camera.cy <= 1 and min(width, height) > 8:
-            raise DataError(
-                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be a fraction of the picture;"
-                f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
-            )
-        if not (-0.5 <= camera.cx <= width and -0.5 <= camera.cy <= height):
-            raise DataError(
-                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of these {found} pictures;"
-                " expected a calibration of pictures of this size, or its width and height beside it"
-            )
-        return camera
-
-    def require_clear_scale(self) -> None:
-        """Raises DataError when the declared raw units per meter are so few that they mean something else."""
-        if self.depth_scale is not None and self.depth_scale < _AMBIGUOUS:
-            raise DataError(
-                f"{self.source}: declares a depth scale that would be {self.depth_scale:g} raw units per meter, which is"
-                " hardly meant for whole numbers; give --depth-scale, such as 1000 for millimeters"
-            )
-
-    def notes(self) -> list[str]:
-        """Returns lines for the log about what the calibration declares beside the intrinsics."""
-        declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
-        declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
-        declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -135,9 +74,26 @@ def read_calibration(path: Path) -> Calibration:
     if (cameras := _colmap_lines(text)) and path.suffix.lower() == ".txt":
         return _of_colmap(path, cameras)
     numbers = _only_numbers(text)
+    names = re.findall(r"\w+", text[1 : text.find("\n")]) if text.startswith("#") else []
+    if numbers is not None and "fx" in names and len(names) == len(numbers):
+        return _of_mapping(path, dict(zip(names, numbers)))
     if numbers is not None:
         return _of_numbers(path, numbers)
     return _of_mapping(path, _parsed(path, text))
+
+
+def camera_of_arrays(
+    path: Path, arrays: dict[str, np.ndarray]
+) -> tuple[Calibration | None, float | None, tuple[str, ...]]:
+    """Returns the camera and the raw units per meter that small arrays beside those of depth tell, None where they don't, and
+    the names of the arrays that tell nothing of these.
+    """
+    small = {name: array for name, array in arrays.items() if array.size <= _MOST_NUMBERS and array.ndim <= 2}
+    told = {k.lower(): v.item() if v.size == 1 else v.tolist() for k, v in small.items() if v.dtype.kind in "uifU"}
+    camera = _of_mapping(path, told) if _holds_camera(told) else None
+    scale = camera.depth_scale if camera else _depth_scale(path, told, {})
+    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_LENS, *_MODEL, "width", "height") if camera else ()
+    return camera, scale, tuple(k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
 
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:
@@ -157,9 +113,11 @@ def _of_lines(path: Path, text: str) -> dict[str, Any]:
     """Returns what lines of ``key = value`` say, or a row of names and one of values. Raises DataError where two lines differ."""
     lines = [re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines()]
     pairs = [(pair[0], _number_or_text(pair[1])) for pair in lines if len(pair) == 2]
-    rows = [re.split(r"\s*[,;\t]\s*", line.strip()) for line in text.splitlines() if line.strip()]
+    sign = next((sign for sign in ";\t," if sign in text), None)  # beside the first two commas are decimal ones
+    rows = [[cell.strip() for cell in line.split(sign)] for line in text.splitlines() if line.strip()]
     if not pairs and len(rows) == 2 and len(rows[0]) == len(rows[1]):
-        pairs = [(name, _number_or_text(value)) for name, value in zip(*rows)]
+        points = [value if sign == "," else value.replace(",", ".") for value in rows[1]]
+        pairs = [(name.strip('"'), _number_or_text(value.strip('"'))) for name, value in zip(rows[0], points)]
     data = dict(pairs)
     twice = next((name for name, value in pairs if data[name] != value), None)
     if twice:
@@ -186,7 +144,7 @@ def _yaml(path: Path, text: str) -> Any:
 def _number_or_text(text: str) -> Any:
     """Returns the number that a text holds, the list of its numbers where it holds four or more, else the text itself."""
     try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
+        numbers = [float(word) for word in text.rstrip("; ").replace(",", " ").split()]
     except ValueError:
         return text
     return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= len(_TERMS[:4]) else text
@@ -222,6 +180,10 @@ def _only_numbers(text: str) -> list[float] | None:
 
 
 def _of_numbers(path: Path, numbers: list[float]) -> Calibration:
+    if len(numbers) in (4, 6) and max(numbers[-4:-2]) > _ASPECT * abs(min(numbers[-4:-2])):
+        raise DataError(
+            f"{path}: focal lengths {numbers[-4]:g} and {numbers[-3]:g}; expected fx fy cx cy, in this order"
+        )
     if len(numbers) == 4:
         return Calibration(_intrinsics(path, numbers, ()), source=str(path))
     if len(numbers) == 6:  # ARKit's .pincam: the size first
@@ -293,7 +255,7 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
     numbers = _pixels(path, own)
     lens = _lens(path, own)
-    size = _resolution(path, own)
+    size = _resolution(path, own, numbers[2:])
     scale = _depth_scale(path, own, data)
     return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
 
@@ -320,7 +282,19 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
         if _holds_camera(own):
             yield name, {**outer, **own}
         for key, value in data.items():
-            yield from _cameras(f"{name}/{key}".lstrip("/"), value, around, depth + 1)
+            beside = [other for said, other in data.items() if _is_lens_of(str(said), str(key))]
+            lens = {"distortion": beside[0]} if beside else {}
+            yield from _cameras(f"{name}/{key}".lstrip("/"), value, {**around, **lens}, depth + 1)
+
+
+def _is_lens_of(key: str, camera: str) -> bool:
+    """Returns whether a key says that it holds the lens of the camera beside it, such as ``depthDistortion`` of
+    ``depthIntrinsic``.
+    """
+    if not re.search("distort", key, re.IGNORECASE):
+        return False
+    plain = [re.sub(_ABOUT_CAMERAS, "", re.sub("[^a-z]", "", word.lower())) for word in (key, camera)]
+    return plain[0] == plain[1]
 
 
 def _holds_camera(part: dict[str, Any]) -> bool:
@@ -352,12 +326,41 @@ def _are_numbers(values: list[Any]) -> bool:
     )
 
 
-def _resolution(path: Path, own: dict[str, Any]) -> tuple[int, int]:
-    size = own.get("resolution")
-    pair = size if isinstance(size, list) and len(size) == 2 else [_first(own, _WIDTH), _first(own, _HEIGHT)]
-    if not all(isinstance(value, (int, float)) for value in pair) or any(value <= 0 for value in pair):
+def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[int, int]:
+    """Returns width and height of the pictures, 0 where nothing tells them. Two numbers of one entry stand in the order that
+    puts the principal point ``center`` nearer to the middle.
+    """
+    size = next((value for key, value in own.items() if _SIZE.match(_letters(key))), None)
+    if isinstance(size, dict):
+        return _resolution(path, {str(key).lower(): value for key, value in size.items()}, center)
+    if isinstance(size, str):
+        size = [float(number) for number in re.findall(r"\d+", size)]
+    pair = size if isinstance(size, list) and len(size) == 2 else _sides(own)
+    if not _are_numbers(pair) or any(value <= 0 for value in pair):
         return 0, 0
-    return _pixel_counts(path, *pair)
+    turned = size is pair and _off_middle(center, pair[::-1]) < _off_middle(center, pair)
+    return _pixel_counts(path, *(pair[::-1] if turned else pair))
+
+
+def _sides(own: dict[str, Any]) -> list[Any]:
+    """Returns the width and the height that a mapping names, those of the color camera only where there are no others."""
+    for other in ("-", "color|rgb"):
+        found = []
+        for side in _SIDES:
+            known = re.compile(_SIZE_OF.format(other) + side)
+            keys = sorted((key for key in own if known.match(_letters(key)) and own[key] is not None), key=len)
+            found.append(own[keys[0]] if keys else None)
+        if None not in found:
+            return found
+    return [None, None]
+
+
+def _letters(key: str) -> str:
+    return re.sub("[^a-z]", "", key)
+
+
+def _off_middle(center: list[float], size: list[float]) -> float:
+    return sum(abs((at + 0.5) / side - 0.5) for at, side in zip(center, size) if side > 0)
 
 
 def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
@@ -371,6 +374,8 @@ def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
 def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
     values = _first(own, _LENS)
+    told = own.get("distortion")  # as RealSense's tools print it, or what stands beside the coefficients
+    told = _first({str(k).lower(): v for k, v in told.items()}, _MODEL) if isinstance(told, dict) else told
     if isinstance(values, dict):
         values = values["data"] if "data" in values else _named_terms(path, values)
     if values is None and any(key in own for key in _TERMS):
@@ -381,7 +386,7 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
     if not _are_numbers(flat):
         raise DataError(f"{path}: its lens has the coefficients {str(flat):.80}; expected numbers")
-    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat)
+    return lens_coefficients(path, str((isinstance(told, str) and told) or _first(own, _MODEL) or ""), flat)
 
 
 def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
@@ -400,7 +405,7 @@ def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, 
     """
     if not any(flat):
         return ()
-    model = name.lower().replace("distortion.", "").replace("-", "_")
+    model = re.sub("[- ]", "_", name.lower().replace("distortion.", ""))
     if model not in _BROWN or len(flat) not in (4, 5, 8, 12, 14):
         raise DataError(
             f"{path}: its lens is of model {model or 'unknown'} with {len(flat)} coefficients that aren't all 0; expected"
@@ -410,15 +415,36 @@ def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, 
 
 
 def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> float | None:
-    """Returns raw units per meter; small values are meters per unit, as RealSense has them."""
+    """Returns raw units per meter; small values are meters per unit, as RealSense has them.
+
+    Raises DataError where what is said is no scale, or two scales differ.
+    """
     top = {str(key).lower(): value for key, value in whole.items()}
-    value = next((part[name] for part in (own, top) for name in _SCALE if part.get(name) is not None), None)
-    if value is None and "scale" in own and "fx" in own:  # as mappers of rooms write it
-        value = own["scale"]
-    if value is None:
-        return None
+    said = [{k: v for k, v in part.items() if _is_scale(k) and v is not None} for part in (own, top)]
+    found = said[0] or said[1]
+    if not found and "scale" in own and "fx" in own:  # as mappers of rooms write it
+        found = {"depth_scale": own["scale"]}
+    scales = {key: _units_per_meter(path, key, value) for key, value in found.items()}
+    if scales and max(scales.values()) > 1.001 * min(scales.values()):
+        raise DataError(
+            f"{path}: {' and '.join(scales)} give different depth scales ({', '.join(f'{v:g}' for v in scales.values())} raw"
+            " units per meter); expected one of them"
+        )
+    return next(iter(scales.values()), None)
+
+
+def _is_scale(key: str) -> bool:
+    return _SCALE.fullmatch(_letters(key)) is not None
+
+
+def _units_per_meter(path: Path, key: str, value: Any) -> float:
+    """Returns the raw units per meter that a depth scale means. Its key may end with a unit, in which the value is then."""
     if isinstance(value, str) and (unit := unit_of(f"in {value}")):
         return 1 / UNITS[unit]
     if not _are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
+    match = _SCALE.fullmatch(_letters(key))
+    if match and (unit := unit_of(f"in {match[2]}")):
+        size = value * UNITS[unit] if match[1] != "per" else UNITS[unit] / value
+        return float(f"{1 / size:.12g}")
     return float(value) if value >= 1 else float(f"{1 / value:.12g}")

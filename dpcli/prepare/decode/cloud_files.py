@@ -14,7 +14,7 @@ from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text
-from dpcli.regular_files import stand_in
+from dpcli.runtime.clips.other_files import stand_in
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".ply": read_ply,

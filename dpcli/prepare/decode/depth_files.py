@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +18,11 @@ from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.regular_files import stand_in
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.other_files import stand_in
 
 if TYPE_CHECKING:
+    from dpcli.prepare.decode.pinhole_camera import Calibration
     from dpcli.prepare.decode.video_streams import VideoStream
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -30,6 +31,7 @@ ARRAY_SUFFIXES = (".npy", ".npz")
 FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  # of two files of one frame the earlier is preferred
 # names that say depth, and not a picture of it or what lies beside it
 _DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
+_OTHERWISE = re.compile(r"disparit|(?<![a-z])disp(_?map)?(?![a-z])|(?<![a-z])inv(erse)?[-_ ]?depth", re.IGNORECASE)
 _GRAY_NOISE, _COLORED_SHARE = (
     24,
     0.02,
@@ -40,6 +42,7 @@ _SIZES = (  # (height, width) of depth cameras
     *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
     *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
 )
+_MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
 _LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
@@ -55,7 +58,7 @@ class DepthVideo:
 
     missing: how many more frames the file declares than it holds, such as a recording that was cut. ends_early: the file
     stops before its container does, whether or not it says how many frames there were. notes: counts of what else is
-    missing or doubtful.
+    missing or doubtful. camera, scale: of raw units per meter, where the file itself tells them.
     """
 
     frames: np.ndarray
@@ -63,6 +66,8 @@ class DepthVideo:
     missing: int = 0
     ends_early: bool = False
     notes: dict[str, int] = field(default_factory=dict)
+    scale: float | None = None
+    camera: Calibration | None = None
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
@@ -351,6 +356,17 @@ def says_depth(name: str) -> bool:
     return re.search(_DEPTH_NAME, name, re.IGNORECASE) is not None
 
 
+def require_depth(path: Path, name: str) -> None:
+    """Raises DataError where a video's name says that it holds disparities or the inverse of depth."""
+    said = _OTHERWISE.search(name)
+    if said and (said[0].lower().startswith("inv") or not says_depth(name)):
+        what = "the inverse of depth" if said[0].lower().startswith("inv") else "disparities"
+        raise DataError(
+            f"{path}: by its name it holds {what}, not depth; depth is focal length x baseline / disparity. Save it as depth,"
+            " or call it otherwise if it is"
+        )
+
+
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame (H,W), by its header where it has one."""
     try:
@@ -372,7 +388,10 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
 
     Raises DataError of what is none, such as the poses of a camera.
     """
-    array = map_npy(path) if path.suffix.lower() == ".npy" else _archived(path)
+    return _as_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else _archived(path)[0], stride)
+
+
+def _as_frames(path: Path, array: np.ndarray, stride: int = 1) -> np.ndarray:
     if array.ndim == 2:
         array = array[None]
     if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
@@ -382,7 +401,7 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
         )
     _require_frames_first(path, array.shape)
-    if array.shape[1:] in ((3, 3), (3, 4), (4, 4)) and _are_matrices(array):
+    if array.shape[1:] in _MATRICES and _are_matrices(array):
         raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
     return np.ascontiguousarray(array[::stride])
 
@@ -398,15 +417,24 @@ def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
         )
 
 
-def _archived(path: Path) -> np.ndarray:
-    """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions."""
+def _archived(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions, and the others."""
     arrays = read_arrays(path)
-    called = [key for key in arrays if says_depth(key)]
+    called = [k for k, v in arrays.items() if says_depth(k) and v.ndim > 1 and v.shape not in _MATRICES]
     shaped = [key for key, array in arrays.items() if array.ndim in (2, 3) and array.dtype.kind in "uif"]
     chosen = next((choice[0] for choice in (called, shaped) if len(choice) == 1), None)
     if chosen is None:
         raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called depth")
-    return arrays[chosen]
+    return arrays.pop(chosen), arrays
+
+
+def _told_beside(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Returns what the arrays beside those of depth tell, by the fields of a `DepthVideo`."""
+    from dpcli.prepare.decode.calibration import camera_of_arrays
+
+    camera, scale, unread = camera_of_arrays(path, arrays)
+    notes = {f"videos whose .npz holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
+    return {"camera": camera, "scale": scale, "notes": notes}
 
 
 def _are_matrices(array: np.ndarray) -> bool:
@@ -430,8 +458,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         times = series.times()
         first = series.paths[0]
         white = first.suffix.lower() in (".tif", ".tiff") and has_white_at_zero(first.read_bytes())
-        notes = {WHITE_AT_ZERO: 1} if white else {}
-        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], notes=notes)
+        told: dict[str, Any] = {"notes": {WHITE_AT_ZERO: 1} if white else {}}
+        told = _told_beside(first, _archived(first)[1]) if first.suffix.lower() == ".npz" else told
+        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], **told)
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         try:
             video = _read_file(path, stride)
@@ -446,6 +475,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
 
 def _read_file(path: Path, stride: int) -> DepthVideo:
     """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
+    if path.suffix.lower() == ".npz":
+        array, others = _archived(path)
+        return DepthVideo(_as_frames(path, array, stride), **_told_beside(path, others))
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
     frames, time, missing = read_timed_video(path, stride)

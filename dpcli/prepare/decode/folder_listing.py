@@ -27,6 +27,13 @@ def walk_folders(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
         yield folder, below, names
 
 
+def files_below(root: Path) -> list[Path]:
+    """Returns all files below ``root`` that aren't hidden, sorted; those in folders that links name too."""
+    return sorted(
+        Path(folder, name) for folder, _, names in walk_folders(root) for name in names if not is_hidden(name)
+    )
+
+
 def _leads_above(path: str) -> bool:
     """Returns whether a folder is a link to one that holds it, on the way by which it was reached or in truth."""
     if not os.path.islink(path):

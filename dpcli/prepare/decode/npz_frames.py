@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import read_member, require_room
+from dpcli.npy_files import open_archive, read_member, require_room
 from dpcli.prepare.decode.safe_pickle import load_arrays
 
 
 def member_names(path: Path) -> list[str]:
     """Returns the arrays in an .npz, without reading them. Raises DataError when it is none."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
     except (zipfile.BadZipFile, OSError) as error:
         raise DataError(f"{path}: not a readable .npz file, perhaps truncated ({error})") from None
@@ -30,7 +30,7 @@ def read_frames(path: Path, key: str) -> list[np.ndarray]:
     An object array is a pickle: it is read through an allow list of plain arrays. Raises DataError on anything else.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             info = archive.getinfo(f"{key}.npy")
             require_room(path, info.file_size)
             array = _read_array(path, archive.read(info))

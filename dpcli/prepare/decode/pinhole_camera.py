@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
+
+_AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
+_ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
+_MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
 
 @dataclass(frozen=True)
@@ -126,3 +130,61 @@ def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndar
     if unit != 1:
         z *= unit
     return z
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
+
+    intrinsics: Intrinsics
+    width: int = 0
+    height: int = 0
+    depth_scale: float | None = None
+    source: str = "the options"
+
+    def of_pictures(self, width: int, height: int) -> Intrinsics:
+        """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
+
+        Raises DataError when they are of another shape, or when the principal point lies outside of the pictures.
+        """
+        own, found = f"{self.width}x{self.height}", f"{width}x{height}"
+        camera = self.intrinsics
+        if self.width and self.height and (self.width, self.height) != (width, height):
+            x, y = width / self.width, height / self.height
+            if abs(x / y - 1) > _ASPECT:
+                raise DataError(
+                    f"{self.source}: is of {own} pictures, these have {found}, which is another shape; expected the"
+                    " calibration of the depth camera itself"
+                )
+            middle = ((camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
+            camera = replace(camera, fx=camera.fx * x, fy=camera.fy * y, cx=middle[0], cy=middle[1])
+        if 0 < camera.cx <= 1 and 0 < camera.cy <= 1 and min(width, height) > 8:
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be a fraction of the picture;"
+                f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
+            )
+        across, down = (camera.cx + 0.5) / width, (camera.cy + 0.5) / height
+        outside = not (0 <= across <= 1 + 0.5 / width and 0 <= down <= 1 + 0.5 / height)
+        scaled = not self.width and abs(across - down) < _ALIKE and not _MIDDLE[0] < across < _MIDDLE[1]
+        if outside or scaled:
+            where = "lies outside of" if outside else "seems to be of another size than"
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) {where} these {found} pictures;"
+                " expected a calibration of pictures of this size, or its width and height beside it"
+            )
+        return camera
+
+    def require_clear_scale(self) -> None:
+        """Raises DataError when the declared raw units per meter are so few that they mean something else."""
+        if self.depth_scale is not None and self.depth_scale < _AMBIGUOUS:
+            raise DataError(
+                f"{self.source}: declares a depth scale that would be {self.depth_scale:g} raw units per meter, which is"
+                " hardly meant for whole numbers; give --depth-scale, such as 1000 for millimeters"
+            )
+
+    def notes(self) -> list[str]:
+        """Returns lines for the log about what the calibration declares beside the intrinsics."""
+        declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
+        declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
+        declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
+        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []

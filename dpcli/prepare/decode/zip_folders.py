@@ -13,6 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import require_distinct
 
 _LOCAL = struct.Struct(
     "<4s22x2H"
@@ -69,6 +70,7 @@ def read_files(path: Path, folder: ZipFolder) -> Iterator[tuple[str, bytes]]:
 
     Raises DataError when a file is damaged, encrypted, or packed by a method other than stored or deflated.
     """
+    require_distinct(path, folder.names)
     with open(path, "rb") as file:
         for name, entry in zip(folder.names, folder.entries, strict=True):
             yield name, _content(file, f"{path}/{name}", *entry.tolist())

@@ -145,7 +145,7 @@ def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool
     center, size = bounding_sphere(mesh.positions[seen])
     cosine, sine = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-    scale = radius / max(size, 1e-12)
+    scale = radius / max(size, 1e-300)
     return mesh.moved(rotation, -scale * rotation @ center, scale)
 
 

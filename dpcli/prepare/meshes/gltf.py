@@ -271,7 +271,7 @@ def read_gltf(path: Path) -> Gltf:
     refuse_other_formats(path, data)
     text, binary = _split_glb(path, data) if data[:4] == b"glTF" else (data, None)
     try:
-        tree = parse_json(text.rstrip(b"\0"), path)  # some exporters fill the chunk up with them
+        tree = parse_json(text.rstrip(b"\0"), path, as_browsers=True)  # some exporters fill the chunk up with them
         version = str(tree["asset"]["version"])
     except (DataError, KeyError, TypeError):
         raise not_gltf(Path(path)) from None

@@ -46,11 +46,12 @@ def read_material(file: Gltf, index: int) -> Material:
     if not 0 <= strength < np.inf:
         raise file.fail(f"material {index}: its emission has the strength {strength}; export the file again")
     glow = tuple(strength * value for value in _numbers(file, index, entry.get("emissiveFactor"), (0, 0, 0)))
+    mode = str(entry.get("alphaMode", "OPAQUE"))
     shines = any(glow) and not unlit
     return Material(
         _numbers(file, index, color, (1, 1, 1, 1)),
         _texture(file, texture) if texture else None,
-        str(entry.get("alphaMode", "OPAQUE")).lower(),
+        mode.lower() if mode in ("MASK", "BLEND") else "opaque",  # other words are none, as viewers have it
         float(entry.get("alphaCutoff", 0.5)),
         unlit,
         emission=glow if shines else (0.0, 0.0, 0.0),
@@ -85,10 +86,11 @@ def _change(reference: dict[str, Any]) -> dict[str, Any]:
 def _numbers(file: Gltf, index: int, values: Any, rest: tuple[int, ...]) -> tuple[float, ...]:
     try:
         found = tuple(float(np.clip(value, 0, 1)) for value in (values or rest))
-        assert len(found) == len(rest) and np.isfinite(found).all()
-    except (TypeError, ValueError, AssertionError):
+    except (TypeError, ValueError):
+        found = ()
+    if len(found) != len(rest) or not np.isfinite(found).all():
         count = {3: "three", 4: "four"}[len(rest)]
-        raise file.fail(f"material {index}: its color is not {count} numbers; export the file again") from None
+        raise file.fail(f"material {index}: its color is not {count} numbers; export the file again")
     return found
 
 

@@ -108,7 +108,7 @@ def skin(
         cofactor = np.stack([np.cross(rows[:, (i + 1) % 3], rows[:, (i + 2) % 3]) for i in range(3)], axis=1)
         sign = np.sign(np.einsum("va,va->v", rows[:, 0], cofactor[:, 0]))[:, None]
         direction = np.einsum("vab,vb->va", cofactor, n) * np.where(sign == 0, 1, sign)
-        turned[t] = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+        turned[t] = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-300)
     return moved, turned
 
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.calibration import Calibration
+from dpcli.prepare.decode.pinhole_camera import Calibration
 from dpcli.prepare.recordings.messages import CAMERA_KINDS, IMAGE_KINDS, calibration_of_message, depth_of_message
 from dpcli.prepare.recordings.recording import Recording, open_recording
 from dpcli.prepare.recordings.topic_frames import TopicFrames, read_topic
@@ -15,11 +15,14 @@ _SAYS_DEPTH = re.compile(r"depth|range|(?<![a-z])(tof|z16)(?![a-z])", re.IGNOREC
 _OTHER_IMAGES = re.compile(
     r"colou?r|rgb|infra|mask|conf|amplitude|intensity|(?<![a-z])(ir|mono|gray|grey)(?![a-z])", re.IGNORECASE
 )
+_UNITS = "/option/Depth_Units/value"  # behind a sensor's name, as the SDK of RealSense writes it: meters per raw unit
 _DISPARITY = re.compile("disp(arity|_?map)?(?![a-z])", re.IGNORECASE)
 
 
-def read_recorded_depth(path: Path, topic: str = "", stride: int = 1) -> tuple[TopicFrames, Calibration | None]:
-    """Returns the frames, each (H,W) as stored and all alike, and the camera or None.
+def read_recorded_depth(
+    path: Path, topic: str = "", stride: int = 1
+) -> tuple[TopicFrames, Calibration | None, float | None]:
+    """Returns the frames, each (H,W) as stored and all alike, the camera or None, and raw units per meter or None.
 
     topic: of the images, "" for the only one of depth. Raises DataError when there is none or it can't be read.
     """
@@ -35,7 +38,7 @@ def read_recorded_depth(path: Path, topic: str = "", stride: int = 1) -> tuple[T
             raise DataError(f"{path}: images of {name} differ in size or type: {found}; expected one kind")
         if read.frames[0].itemsize == 1 and not topic and not _SAYS_DEPTH.search(name):
             raise DataError(f"{path}: {name} holds 8-bit images, hardly depth; if they are, name it with --topic")
-        return read, _camera(recording, name)
+        return read, _camera(recording, name), _raw_units(recording, name)
 
 
 def _depth_topic(recording: Recording, topic: str) -> str:
@@ -57,12 +60,36 @@ def _depth_topic(recording: Recording, topic: str) -> str:
 
 
 def _camera(recording: Recording, topic: str) -> Calibration | None:
-    """Returns the camera of the camera_info that lies nearest above the topic, such as ``/camera/depth/camera_info``."""
-    parts = topic.strip("/").split("/")
+    """Returns the camera of the camera_info that lies nearest above the topic, such as ``/camera/depth/camera_info``; of
+    several there the one whose name says depth.
+    """
+    parts = _folder(topic, "")
     infos = [name for name, (kind, count) in recording.topics.items() if kind in CAMERA_KINDS and count]
-    above = [name for name in infos if parts[: name.strip("/").count("/")] == name.strip("/").split("/")[:-1]]
-    if not above:
-        return None
-    nearest = max(above, key=lambda name: name.count("/"))
-    message = next(recording.messages(nearest), None)
+    depth = {name: len(_folder(name)) for name in infos if parts[: len(_folder(name))] == _folder(name)}
+    nearest = [name for name in depth if depth[name] == max(depth.values())]
+    if len(nearest) > 1:
+        nearest = [name for name in nearest if _SAYS_DEPTH.search(name.rpartition("/")[2])]
+    message = next(recording.messages(nearest[0]), None) if len(nearest) == 1 else None
     return calibration_of_message(recording.path, topic, message.content) if message else None
+
+
+def _folder(topic: str, info: str = "info") -> list[str]:
+    """Returns the names above a topic's own, without the last where that is ``info``, in which RealSense puts its camera."""
+    *above, _ = topic.strip("/").split("/")
+    return above[:-1] if info and above[-1:] == [info] else above
+
+
+def _raw_units(recording: Recording, topic: str) -> float | None:
+    """Returns the raw units per meter that the topic's sensor is set to; None where nothing says it.
+
+    Raises DataError where they change on the way.
+    """
+    all_units = [name for name in recording.topics if name.endswith(_UNITS)]
+    own = [name for name in all_units if topic.startswith(f"{name.removesuffix(_UNITS)}/")]
+    told = {float(message.content.data) for name in own for message in recording.messages(name)}
+    if len(told) > 1:
+        raise DataError(
+            f"{recording.path}: {own[0]} changes on the way ({', '.join(f'{value:g}' for value in sorted(told))}); expected"
+            " one unit of depth in a recording"
+        )
+    return next((float(f"{1 / value:.6g}") for value in told if value > 0), None)

@@ -10,9 +10,9 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
-from dpcli.prepare.decode.calibration import Calibration, lens_coefficients
+from dpcli.prepare.decode.calibration import lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 
 CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)

@@ -13,13 +13,14 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
-from dpcli.prepare.scans.cleaning import clean, ends_of
+from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
 from dpcli.store.schema import kept_name
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
 _COUNTED, _LOOKED_AT = 20.0, 1000  # meters from which on whole numbers alone are odd, and points that tell
+_DEGREES, _UPRIGHT = 0.01, 100.0  # sides as shares of how far away they lie; height as a multiple of them
 _COARSE = 0.01  # meters between neighboring float32 numbers, from which on a shape is lost
 COARSE = (
     "sequences whose files hold map coordinates in float32, which rounds them to 1 cm or more; write them in double"
@@ -64,7 +65,8 @@ def assemble(
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
-    notes |= {**dropped, **converted}
+    crowded = is_crowded(clouds[kept[len(kept) // 2]].points)
+    notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
     frames = [clouds[t].points for t in kept]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor
@@ -116,6 +118,9 @@ def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[
     """Returns notes about lengths that no sensor sees. low, high: the ends of the original coordinates, f64 (3); some:
     points as they were read, or None.
     """
+    sides = high - low
+    if 0 < sides[:2].max() < _DEGREES * np.abs([low, high]).max(0)[:2].min() and sides[2] > _UPRIGHT * sides[:2].max():
+        return {"sequences far higher than wide, in x and y far from 0; are these degrees? Project them to meters": 1}
     widest, farthest = float((high - low).max()), float(np.abs([low, high]).max())
     if widest > _ABSURD:
         return {"sequences more than 100 km wide; are they in meters? --scale N divides them": 1}

@@ -10,9 +10,14 @@ import numpy as np
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN, Cloud
 
 NOT_FINITE = "points with NaN or infinity dropped"
+CROWDED = (
+    "sequences in which many points of a frame lie at one and the same place; returns that met nothing, or padding?"
+)
 IMPOSSIBLE = "points at impossible places (such as 1e30 or -9999 on all axes) dropped"
 _STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -32768.0, -(2.0**31), 2.0**31 - 1)
 # on all three axes
+_ROUNDED = 1e-8  # what remains of 0 where points were turned, or the smallest number of a type
+_SAMPLED, _SEVERAL = 2048, 8
 _FARTHEST = 1e10  # no map has such coordinates, in any unit
 
 
@@ -30,11 +35,26 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
             found[NOT_FINITE] += _drop(cloud, ~np.isfinite(cloud.points).all(1))
             ends = ends_of(cloud.points)
         found[IMPOSSIBLE] += _drop(cloud, _impossible(cloud.points, float(np.abs(ends).max())))
-        zero = cloud.points[:, 0] == 0
-        origins.append(zero & (cloud.points[:, 1:] == 0).all(1) if zero.any() else zero)
+        zero = np.abs(cloud.points[:, 0]) < _ROUNDED
+        origins.append(zero & (np.abs(cloud.points[:, 1:]) < _ROUNDED).all(1) if zero.any() else zero)
     if any(np.count_nonzero(own) > 1 for own in origins) or _far_from_origin(clouds, origins):
         found[AT_ORIGIN] = sum(_drop(cloud, own) for cloud, own in zip(clouds, origins))
     return {what: count for what, count in found.items() if count}
+
+
+def is_crowded(points: np.ndarray) -> bool:
+    """Returns whether a hundredth of some points (N,3) or more are at one place: nobody measured these, but they aren't the
+    origin, such as where a scanner's own axes were turned into those of a vehicle.
+    """
+    some = points[:: max(1, len(points) // _SAMPLED)]
+    least = max(_SEVERAL, len(some) // 100)
+    x = np.sort(some[:, 0])
+    alike = x[least:][x[least:] == x[:-least]] if len(some) > least else x[:0]
+    for value in dict.fromkeys(alike.tolist()):
+        others = some[some[:, 0] == value, 1:]
+        if np.unique(others, axis=0, return_counts=True)[1].max() > least:
+            return True
+    return False
 
 
 def _drop(cloud: Cloud, bad: np.ndarray) -> int:

@@ -22,13 +22,19 @@ _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  #
 _ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the camera or the objects
     r"oxts|imu|gps|gnss|poses?|odom\w*|calib\w*|labels?|label_\d|time_?stamps?|traj\w*|(in|ex)trinsics?", re.IGNORECASE
 )
+_OF_POINTS = re.compile(  # folders whose arrays tell more of the points that lie beside
+    r"normals?|colou?rs?|rgb|flows?|feat(ure)?s?|seg\w*|masks?|intensit(y|ies)|reflect\w*|weights?|ids?", re.IGNORECASE
+)
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
-    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
+    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
+    " .bag .mcap .db3 .active .bz2 .xz .zst".split()
 )
 _ADVICE = {
-    **dict.fromkeys((".gz", ".zip", ".7z", ".rar"), "unpack them"),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst"), "unpack them"),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
+    ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     ".e57": "save their points as .ply, such as with CloudCompare",
 }
@@ -60,14 +66,21 @@ def find_sequences(
 
 
 def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[Series]:
-    """Returns the sequences without the texts of folders such as KITTI's ``oxts``, all of them where there is nothing else.
+    """Returns the sequences without the texts of folders such as KITTI's ``oxts``, one text above the folders of clouds, and
+    arrays of normals, colors and the like; all of them where there is nothing else.
 
     The first one names those as left out, and the poses that were found.
     """
+    scans = [one for one in found if one.suffix not in TEXTS]
 
     def is_log(one: Series) -> bool:
-        parts = one.folder.relative_to(root).parts
-        return one.suffix in TEXTS and any(_ABOUT_SENSORS.fullmatch(part) for part in parts)
+        if one.suffix not in TEXTS:
+            if one.folder == root or not _OF_POINTS.fullmatch(one.folder.name):
+                return False
+            twins = [other for other in scans if other.folder.parent == one.folder.parent and other is not one]
+            return any(one.stems == other.stems for other in twins)
+        above = len(one.names) == 1 and any(one.folder in other.folder.parents for other in scans)
+        return above or any(_ABOUT_SENSORS.fullmatch(part) for part in one.folder.relative_to(root).parts)
 
     logs = [one for one in found if is_log(one)]
     logs = [] if len(logs) == len(found) else logs

@@ -9,7 +9,15 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_frame_column
 from dpcli.prepare.reader import natural_key
-from dpcli.prepare.scans.times_of_tables import SHORTEST, Clock, Table, clock_seconds, seconds_and_parts, seconds_of
+from dpcli.prepare.scans.times_of_tables import (
+    SHORTEST,
+    Clock,
+    Table,
+    clock_seconds,
+    seconds_and_parts,
+    seconds_of,
+    unit_by_rate,
+)
 from dpcli.runtime.clips.name_numbers import NumberColumns, parse_name
 
 SINGLE = (
@@ -48,6 +56,8 @@ class Rows:
         if unit:
             told = _rising(since * unit)
             return told if told is not None or not fps else np.arange(len(since)) / fps
+        if fps and (unit := unit_by_rate(column, self.frames, fps)):
+            return since * unit
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
         return since / max(int(step), 1) / fps if fps else None
 
@@ -108,7 +118,10 @@ def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | N
         try:
             values = table.columns([place])[:, 0]
         except DataError:
-            return _values_of_words(table, column, table.words(place))
+            words = table.words(place)
+            if 2 * sum(word.isdecimal() for word in words) > len(words):
+                raise  # such as of a row of means below the others
+            return _values_of_words(table, column, words)
     else:
         values = moments
     _require_all(table, column, np.isfinite(values))

@@ -20,8 +20,10 @@ from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.cloud_series import refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
+from dpcli.runtime.clips.other_files import stand_in
 from dpcli.store.schema import kept_name
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
@@ -80,6 +82,7 @@ class TableSequences:
     @cached_property
     def _paths(self) -> dict[str, Path]:
         """Returns the tables by the names of their sequences."""
+        refuse_file(self.raw, ())
         if self.raw.is_file():
             return {as_utf8(self.raw.stem): self.raw}
         if not self.raw.is_dir():
@@ -213,7 +216,10 @@ def _load(
 ) -> Loaded:
     if not facts[0]:
         raise DataError(f"{path}: the file is empty")
-    table = ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
+    try:
+        table = ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
+    except DataError as error:
+        raise (stand_in(path) or error) from None
     column = frame_column(table, wanted)
     cloud = cloud_of_table(table, keep)
     axes = cloud.columns

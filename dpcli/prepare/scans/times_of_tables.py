@@ -83,12 +83,26 @@ def seconds_of(column: str, values: np.ndarray) -> float:
         told = words_of(inside[1])
         if not set(told) <= _NO_UNITS:
             return _IN_BRACKETS.get(" ".join(told), 0.0)
-    if not (values == np.floor(values)).all():
-        return 1.0
     digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
-    unit = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 and set(words) & _TIME_WORDS else 0.0
+    epoch = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 else 0.0
+    if not (values == np.floor(values)).all():
+        return epoch or 1.0  # milliseconds since 1970 may have fractions
+    unit = epoch if set(words) & _TIME_WORDS else 0.0
     steps = np.diff(np.unique(values)) if unit else values[:0]
     return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
+
+
+def unit_by_rate(column: str, values: np.ndarray, fps: float) -> float:
+    """Returns how many seconds one unit of a column of times in whole numbers is, if one makes its steps those of ``fps``; else
+    0.
+
+    >>> unit_by_rate("time", np.array([0, 33, 67, 100]), 30), unit_by_rate("t", np.array([0, 1, 2, 5]), 30)
+    (0.001, 0.0)
+    """
+    if not set(words_of(column)) & _TIME_WORDS or len(values) < 2:
+        return 0.0
+    step = float(np.median(np.diff(np.unique(values)))) * fps
+    return next((unit for unit in (1e-3, 1e-6, 1e-9) if 0.5 < step * unit < 2), 0.0)
 
 
 def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:

@@ -30,6 +30,7 @@ _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
 _LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
+_LONGEST = 1000  # times the width of the picture: no lens for objects is that long
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
 
@@ -66,6 +67,11 @@ class View:
             raise DataError(
                 f"{place.parent}: a focal length of {min(fx, fy):g} pixels for pictures of {width / across:g}x{height / down:g}; "
                 "expected pixels, not shares of the picture or millimeters"
+            )
+        if fx > _LONGEST * (width / across) or fy > _LONGEST * (height / down):
+            raise DataError(
+                f"{place.parent}: a focal length of {max(fx, fy):g} pixels for pictures of {width / across:g}x{height / down:g}; "
+                "no camera sees so little (is camera_angle_x in radians?)"
             )
         cx, cy = lens.get("cx", 0.5 * width / across), lens.get("cy", 0.5 * height / down)
         if 0 < cx <= 1 and 0 < cy <= 1 and min(width / across, height / down) > 2:

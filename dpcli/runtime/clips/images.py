@@ -26,6 +26,9 @@ _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many 
 _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds
 _COLORS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # modes of 8 bits
+_WEBP_FLAGS, _MOVES, _ALPHA = 20, 2, 16  # the byte of flags in an extended WebP, and two of them
+_EXTRA_SAMPLES = 338  # a tag of TIFF
+_SAID: set[str] = set()
 _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
 _OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
@@ -52,11 +55,37 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
     """Opens an image whose size is plausible. Raises DataError where it isn't, and what Pillow does for one that is damaged."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    try:
+        opened = Image.open(_with_alpha_of_webp(path) or path)
+    except Image.DecompressionBombError as error:
+        raise DataError(f"{path}: not a picture of plausible size ({error}); export it smaller") from None
+    with opened as image:
         require_plausible(path, *image.size, path.stat().st_size)
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
+        _tell_unread_channel(path, image)
         yield image
+
+
+def _with_alpha_of_webp(path: Path) -> BytesIO | None:
+    """Returns an animated WebP that says it has no alpha with the mark that it has: what none of its pictures covers is clear,
+    as in browsers, and Pillow makes it black. None for other files.
+    """
+    with path.open("rb") as file:
+        start = file.read(_WEBP_FLAGS + 1)
+        if start[:4] != b"RIFF" or start[8:16] != b"WEBPVP8X" or start[-1] & (_MOVES | _ALPHA) != _MOVES:
+            return None
+        return BytesIO(start[:-1] + bytes([start[-1] | _ALPHA]) + file.read())
+
+
+def _tell_unread_channel(path: Path, image) -> None:  # image: PIL.Image.Image
+    """Warns of the further channel of a TIFF that doesn't say what it holds; it may be alpha."""
+    if image.format == "TIFF" and 0 in image.tag_v2.get(_EXTRA_SAMPLES, ()) and "A" not in image.mode.upper():
+        with log.each_once(_SAID):
+            log.warn(
+                f"{path.parent}: a further channel of its TIFFs, of which they don't say that it is alpha (ExtraSamples 0), is not "
+                "read; where it is, export PNG"
+            )
 
 
 def require_one_picture(path: Path, image) -> None:  # image: PIL.Image.Image

@@ -24,7 +24,10 @@ _DATE = re.compile(
 _YEAR_LAST = re.compile(
     r"([0-3]\d)[-_.]([0-3]\d)[-_.]((?:19|20)\d\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
 )
-_SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
+_SECONDS = re.compile(
+    r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|[1-9]\d{6,7}|\d{9}))(?!\d)"
+)  # since 1970, and their parts
+_MICROSECONDS, _NANOSECONDS = 6, 9  # digits of the parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _HALF_DAY = re.compile(r"\d[.:_-]\d\d[ _.-]?[ap]\.?m(?![a-z])", re.IGNORECASE)  # a time before or after noon
 _TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:h])([0-5]\d)\2([0-5]\d)(?!\d)")
@@ -89,7 +92,8 @@ def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool
     ):
         return date, seconds, True
     if digits >= 10 and (parts := _SECONDS.match(stem, plain.start())):
-        return parts, f"{parts[1]}.{parts[2] or parts[3]}", True
+        own = parts[2] or parts[3]
+        return parts, f"{parts[1]}.{own if parts[2] or len(own) == _MICROSECONDS else own.zfill(_NANOSECONDS)}", True
     return plain, plain[0], False
 
 

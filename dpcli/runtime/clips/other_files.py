@@ -78,6 +78,16 @@ def refuse_wrapped(path: Path) -> None:
             raise DataError(f"{path}: {what}")
 
 
+def stand_in(path: Path) -> DataError | None:
+    """Returns the error about a file that could not be read because it only stands in for the data; None of other files."""
+    try:
+        with open(path, "rb") as file:
+            what = what_it_is(file.read(_START), {"pointer": POINTER, "page": PAGE})
+    except OSError:
+        return None
+    return DataError(f"{path}: {what}") if what else None
+
+
 def no_video(path: Path) -> str:
     """Returns what a file is that no decoder takes for a video, and what to do about it."""
     try:

@@ -174,6 +174,19 @@ def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, 
 
 
 @kernel
+def _move(source, motion, moved, rounded, center):
+    """Moves source (3,n): into `moved` as f64, into `rounded` as f32; and computes the center (3)."""
+    for k in range(3):
+        total = 0.0
+        for i in range(source.shape[1]):
+            s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
+            moved[k, i] = s + motion[k, 3]
+            rounded[k, i] = moved[k, i]
+            total += moved[k, i]
+        center[k] = total / source.shape[1]
+
+
+@kernel
 def icp_kernel(source, search, motion, steps, wide, narrow, share):
     """Makes Gauss-Newton steps of robust ICP: motion (3,4) f64 in place, source (3,n) onto the cloud of `search`.
 
@@ -189,14 +202,7 @@ def icp_kernel(source, search, motion, steps, wide, narrow, share):
     bits = work.view(np.int32)
     for step in range(steps):
         scale = wide * (narrow / wide) ** (step / max(steps - 1, 1))
-        for k in range(3):
-            total = 0.0
-            for i in range(count):
-                s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
-                moved[k, i] = s + motion[k, 3]
-                rounded[k, i] = moved[k, i]
-                total += moved[k, i]
-            center[k] = total / count
+        _move(source, motion, moved, rounded, center)
         _look_up(rounded, search, work, bits, at, far)
         total = _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector)
         for a in range(6):  # keeps a line or a single point from turning freely
@@ -215,14 +221,7 @@ def linearize_kernel(source, search, motion, scale, share, matrix, vector, cente
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
     at, far = np.empty(count, np.int64), np.empty(count, np.float32)
     work = np.empty(max(cloud.shape[1], near.shape[2] * count), np.float32)
-    for k in range(3):
-        total = 0.0
-        for i in range(count):
-            s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
-            moved[k, i] = s + motion[k, 3]
-            rounded[k, i] = moved[k, i]
-            total += moved[k, i]
-        center[k] = total / count
+    _move(source, motion, moved, rounded, center)
     _look_up(rounded, search, work, work.view(np.int32), at, far)
     _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector)
     for i in range(6):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.config import FlowConfig, FlowSchedule
@@ -54,6 +54,7 @@ class FlowTrainer:
         self.model = FlowStep3D(network).to(device)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-3)
         self.step, self.best, self.sums, self.spent = 0, float("inf"), [0.0, 0.0, 0], 0.0
+        self.watch = LossWatch()
 
     def run(self) -> FlowStep3D:
         """Trains from wherever the folder's state says to the last step; returns the network.
@@ -99,8 +100,11 @@ class FlowTrainer:
         loss, distance = flow_loss(clouds[:, 0], clouds[:, 1], self.model(clouds[:, 0], clouds[:, 1]))
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)):
+        finite = bool(torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)))
+        if finite:
             self.optimizer.step()
+        if problem := self.watch.see(float(loss.detach()), finite):
+            raise diverged(problem, f"step {self.step + 1}", " with other settings")
         self.sums = [self.sums[0] + float(loss.detach()), self.sums[1] + float(distance), self.sums[2] + 1]
         self.step += 1
 

@@ -52,7 +52,6 @@ class PartNetwork(nn.Module):
         points (2B,N,3): frames 1, then frames 2; matched (2B,N,S): masks with the slots of frames 2 in the order of
         frames 1.
         """
-        assert self.motion is not None
         coarse = self._coarse_mask(points, frames, matched)
         features = self.motion.part_features(frames.level.equivariant, frames.level.points, coarse)
         return self.motion(*features.chunk(2))

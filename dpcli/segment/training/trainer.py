@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dpcli.errors import DpcError
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
 from dpcli.runtime.seeds import SegmentStream, torch_seed
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.rigid_groups import rigid_groups
@@ -59,7 +60,7 @@ class Trainer:
         self.notes, self.stop, self.seed, self.device = notes, stop, seed, next(model.parameters()).device
         self.epoch, self.step, self.best = 0, 0, math.inf
         self.sums: dict[str, list[float]] = {}
-        self.spent = 0.0
+        self.spent, self.watch = 0.0, LossWatch()
         self.optimizer = torch.optim.AdamW(
             model.parameters(), lr=self.schedule.learning_rate, weight_decay=self.schedule.weight_decay
         )
@@ -137,22 +138,33 @@ class Trainer:
             batch.points, rotation = turn_randomly(batch.points, rng)
             batch.flow = batch.flow @ rotation.mT
         rate = self.schedule.learning_rate_at(step, steps)
-        outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
-        self._optimize(outcome.loss, rate)
+        try:
+            outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
+        except torch.linalg.LinAlgError:  # of motions of masks that are no numbers
+            raise self._diverged("the masks are no longer finite", rate) from None
+        stepped = self._optimize(outcome.loss, rate)
+        if problem := self.watch.see(float(outcome.loss.detach()), stepped):
+            raise self._diverged(problem, rate)
         if outcome.flow is not None:
             self._keep_flow(pairs, outcome.flow if rotation is None else outcome.flow @ rotation)
         self._count({"loss": float(outcome.loss.detach()), **outcome.terms})
         return rate
 
-    def _optimize(self, loss: torch.Tensor, rate: float) -> None:
-        """Takes a step along the gradient, whose norm is clipped at 5; none where it is not finite."""
+    def _diverged(self, problem: str, rate: float) -> DpcError:
+        where = f"epoch {self.epoch + 1}, step {self.step + 1}, learning rate {rate:.3g}"
+        return diverged(problem, where, " with a smaller lr")
+
+    def _optimize(self, loss: torch.Tensor, rate: float) -> bool:
+        """Takes a step along the gradient, whose norm is clipped at 5, and returns True; False where it is not finite."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)
-        if torch.isfinite(norm):
+        finite = bool(torch.isfinite(norm))
+        if finite:
             self.optimizer.step()
+        return finite
 
     def _load_batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
         """Returns points, labels and the flows as they stand, estimated now where a pair is new."""
@@ -248,7 +260,6 @@ class Trainer:
 
     def _validation_batches(self) -> list[Batch]:
         """Returns the held-out pairs with their first flows, which are estimated once."""
-        assert self.validation is not None
         pairs = epoch_order(self.validation, 0, self.schedule.validation_pairs)
         batches = []
         for start in range(0, len(pairs), self.schedule.batch):

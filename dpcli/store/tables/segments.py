@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.text_files import parse_json
 
 SUFFIXES = (".csv", ".json")  # of the files
 _NEEDED = ("recording", "start", "end", "class")
@@ -107,12 +108,9 @@ def _text_of(path: Path) -> str:
 
 
 def _json_of(path: str | Path, text: str) -> Mapping[str, Any]:
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged JSON ({error})") from None
-    rows = found.get("segments")
-    if found.get("kind") != "segments" or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+    found = parse_json(text, path)
+    rows = found.get("segments") if isinstance(found, dict) and found.get("kind") == "segments" else None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise DataError(f"{path}: no segments; expected what `dpc classify predict --segments` writes")
     return found
 

@@ -147,7 +147,7 @@ def test_a_stopped_and_a_killed_prediction_go_on(data, run_folder, dpc_here, tmp
     assert dpc_here(*words, tmp_path / "whole.h5").returncode == 0
 
     def started(output: Path, signal_number: int, after: int) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-c", ENDS_EARLY, signal_number, after, *words, output]
+        command = [sys.executable, "-c", ENDS_EARLY, int(signal_number), after, *words, output]
         return subprocess.run(
             [str(word) for word in command], capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
         )

@@ -17,6 +17,7 @@ from dpcli.classify.data.validation_split import (
     cross_folds,
     default_rule,
 )
+from dpcli.classify.network.backbones.point_slots import slot_quantiles
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
@@ -25,7 +26,15 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.schema import kept_name
 
 SPEED = kept_name("speed")
-SMALL = {"frames": 4, "points": 8, "widths": ((8, 8), (16,)), "members": 2, "dropout": 0.0, "copies": False}
+SMALL = {
+    "frames": 4,
+    "points": 8,
+    "widths": ((8, 8), (16,)),
+    "members": 2,
+    "dropout": 0.0,
+    "copies": False,
+    "slot_details": False,
+}
 
 NO_FOREST = torch.tensor(0.0)
 
@@ -148,6 +157,30 @@ def test_copies_are_mirrored_or_reversed_and_have_classifiers_of_their_own(tmp_p
     member.eval()
     each = [torch.softmax(member(member._copied(clip, one), one), -1) for one in kinds[:, None]]
     assert torch.allclose(member.scores(clip, NO_FOREST), torch.stack(each).mean(0), atol=1e-6)
+
+
+def test_details_tell_when_something_happens_and_are_not_moved_by_a_point_far_off(tmp_path):
+    config = config_of(tmp_path, [video()], fields=()).changed(slot_details=True)
+    assert network_config(Given("sparse"), 2).slot_details
+    clips = torch.from_numpy(in_slots(slot_rows(video(), config), config, np.random.default_rng(0)))[None]
+    far = clips.clone()
+    far[0, 1, 7, :3] = 2.9
+    before, after = slot_quantiles(clips).view(4, 5, 3), slot_quantiles(far).view(4, 5, 3)
+    assert torch.allclose(before[1, 1:3], after[1, 1:3], atol=0.3) and before[:, 2, 1].diff().min() > 0
+    assert torch.equal(before[0, 2], clips[0, 0, :, :3].sort(0).values[4]) and torch.isfinite(before).all()
+    clips[0, 2] = 0  # a slot without points
+    assert (slot_quantiles(clips).view(4, 5, 3)[2] == 0).all()
+    for details in (
+        True,
+        False,
+    ):  # without layers over time, what is read is a sum and a maximum, or one slot after the other
+        member = Kinet(config.changed(slot_details=details)).eval().static.members[0]
+        member.over_time = torch.nn.ModuleList()
+        here, late = (
+            member(far, torch.zeros(1, dtype=torch.long)),
+            member(far.flip(1), torch.zeros(1, dtype=torch.long)),
+        )
+        assert torch.allclose(here, late, atol=1e-6) != details
 
 
 def test_whole_people_share_a_fold(tmp_path):

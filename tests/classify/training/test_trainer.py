@@ -18,7 +18,7 @@ from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import load_model
 from dpcli.classify.settings import network_config
-from dpcli.classify.training.optimizer_step import LossWatch, StageStep
+from dpcli.classify.training.optimizer_step import StageStep, watch_of
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
 from dpcli.reproduce.runs import override
@@ -189,14 +189,14 @@ def test_mixed_precision_trains_both_streams_near_float32(backbone, backend, mon
 
 
 def test_a_watch_stops_losses_that_run_away():
-    watch = LossWatch(20)
+    watch = watch_of(20)
     assert all(watch.see(3.0, True) is None for _ in range(50))
     assert [watch.see(float("nan"), False) is None for _ in range(5)] == [True] * 4 + [False]
-    watch = LossWatch(20)
+    watch = watch_of(20)
     assert all(watch.see(float("nan"), False) is None or k == 4 for k in range(5))
-    watch = LossWatch(20)  # single bad steps are left out, as nearly singular fits make them
+    watch = watch_of(20)  # single bad steps are left out, as nearly singular fits make them
     assert all(watch.see(float("nan") if k % 3 else 2.0, k % 3 == 0) is None for k in range(60))
-    watch = LossWatch(20)
+    watch = watch_of(20)
     said = [watch.see(3.0 * 1.2**k, True) for k in range(40)]
     assert said[0] is None and "grew" in said[-1]
 

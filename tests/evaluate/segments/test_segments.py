@@ -142,7 +142,16 @@ def test_a_bad_table_is_named(tmp_path, capsys, rows, told):
 
 @pytest.mark.parametrize(
     "text",
-    ["{", "{}", '{"kind": "segments", "segments": 3}', "a,b\n1,2\n", "", "recording,start,end,class\n" + 200_000 * "x"],
+    [
+        "{",
+        "{}",
+        "[]",
+        '"segments"',
+        '{"kind": "segments", "segments": 3}',
+        "a,b\n1,2\n",
+        "",
+        "recording,start,end,class\n" + 200_000 * "x",
+    ],
 )
 def test_what_is_no_table_is_named(tmp_path, text):
     path = tmp_path / "t.json"

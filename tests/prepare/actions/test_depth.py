@@ -156,6 +156,31 @@ def test_label_tables_as_people_write_them(tmp_path, capsys, text, encoding):
     assert table.unnamed(table.apply(items)) == [f"1 without a label in {tmp_path / 'labels.csv'}: b/3.avi"]
 
 
+def test_names_of_samples_in_either_spelling_of_unicode_and_as_folders(tmp_path):
+    whole, split = "M\u00fcller/1", "Mu\u0308ller/2"  # as macOS writes letters
+    text = "name,label\nMu\u0308ller/1/,wave\n./M\u00fcller/2,push\n"
+    (tmp_path / "labels.csv").write_text(text, encoding="utf-8")
+    items = read_labels(tmp_path / "labels.csv").apply([Item(name, tmp_path) for name in (whole, split)])
+    assert [(item.name, item.label) for item in items] == [(whole, 1), (split, 0)]
+
+
+@pytest.mark.parametrize(
+    ("labels", "said"),
+    [
+        ("1 2", "no sample has label 0; labels count from 0"),
+        ("0 2", ""),
+        ("Wave wave", "Wave and wave are different classes"),
+        ("wave push", ""),
+    ],
+)
+def test_classes_that_are_hardly_meant_are_told(tmp_path, capsys, labels, said):
+    first, second = labels.split()
+    (tmp_path / "labels.csv").write_text(f"name,label\na,{first}\nb,{second}\n")
+    read_labels(tmp_path / "labels.csv")
+    err = capsys.readouterr().err
+    assert said in err and bool(said) == bool(err)
+
+
 def test_labels_that_a_program_wrote_as_fractions_are_whole(tmp_path):
     (tmp_path / "labels.csv").write_text("name,label\na,10.0\nb,2.0\n")
     table = read_labels(tmp_path / "labels.csv")

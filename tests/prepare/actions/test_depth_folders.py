@@ -100,6 +100,48 @@ def test_archives_of_one_frame_each_are_one_clip_and_one_of_many_is_a_video(tmp_
         read(tmp_path / "two.npz")
 
 
+def test_what_an_archive_tells_beside_its_depth_is_used_or_named(tmp_path):
+    told = {"K": np.array([[50.0, 0, 4], [0, 51, 3], [0, 0, 1]]), "depth_scale": np.array([0.0001])}
+    (tmp_path / "frames").mkdir()
+    for t in range(2):
+        np.savez(tmp_path / "frames" / f"{t}.npz", depth=depth(1000 + t), times=[t], **told)
+    np.savez(tmp_path / "many.npz", depth=np.stack([depth(1000), depth(1001)]), times=[0, 1], **told)
+    for path in (tmp_path / "frames", tmp_path / "many.npz"):
+        reader, sequence = read(path)
+        np.testing.assert_allclose(sequence.points[0], [-4 / 50 / 10, -3 / 51 / 10, 0.1], rtol=1e-6)
+        notes = reader.read(reader.items()[0], RNG).notes
+        assert any("arrays that are not read (times)" in note for note in notes)
+        assert first_depths(read(path, depth_scale=1000)[1]) == [1.0, 1.001]
+        assert read(path, fov=60)[1].points[0, 0] < -0.05
+
+
+@pytest.mark.parametrize(
+    ("folder", "names", "what"),
+    [
+        ("disparity", "{}", "disparities"),
+        ("v", "{}_disp", "disparities"),
+        ("inv_depth", "{}", "the inverse of depth"),
+        ("disparity", "{}_depth", ""),
+        ("display", "{}", ""),
+    ],
+)
+def test_what_is_no_depth_by_its_name_is_refused(tmp_path, folder, names, what):
+    write(tmp_path / "in" / folder, **{names.format(t): depth(1000 + t) for t in range(2)})
+    if what:
+        with pytest.raises(DataError, match=f"by its name it holds {what}, not depth"):
+            read(tmp_path / "in")
+    else:
+        assert first_depths(read(tmp_path / "in")[1]) == [1.0, 1.001]
+
+
+def test_disparities_beside_depth_are_left_out(tmp_path):
+    for folder, least in (("disparity", 1000), ("depth", 2000)):
+        write(tmp_path / "in" / folder, **{str(t): depth(least + t) for t in range(2)})
+    reader, sequence = read(tmp_path / "in")
+    assert first_depths(sequence) == [2.0, 2.001]
+    assert "left out, by their names beside depth: disparity" in reader.summary(reader.items())
+
+
 @pytest.mark.parametrize("matrices", [np.eye(4)[None], np.eye(3)[[1, 2, 0]], [[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]])
 def test_matrices_of_a_camera_are_no_depth(tmp_path, matrices):
     np.save(tmp_path / "poses.npy", matrices)
@@ -120,6 +162,16 @@ def test_a_frame_in_two_formats_is_one_frame(tmp_path):
     reader, sequence = read(folder)
     assert first_depths(sequence) == [1.0, 1.001]
     assert any("left out: *.npy (2 files)" in line for line in reader.summary(reader.items()))
+
+
+@pytest.mark.parametrize("picture", [np.full((6, 8), 99, np.uint8), RNG.integers(0, 255, (6, 8, 3)).astype(np.uint8)])
+def test_pictures_beside_arrays_of_depth_are_left_out(tmp_path, picture):
+    folder = write(tmp_path / "v", **{str(t): picture for t in range(2)})
+    for t in range(2):
+        np.save(folder / f"{t}.npy", depth(2000 + t))
+    reader, sequence = read(folder)
+    assert first_depths(sequence) == [2.0, 2.001]
+    assert any("left out: *.png (2 files)" in line for line in reader.summary(reader.items()))
 
 
 @pytest.mark.parametrize("channels", [("Y",), ("Z", "A"), ("R", "G", "B"), ("depth.V",), ("R", "G", "B", "Z")])

@@ -8,9 +8,8 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.actions.depth_units import require_plausible, without_marks
-from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.decode.folder_listing import unreadable_entries
-from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.scans.clouds import CloudFolders
 
 RNG = np.random.default_rng(0)
@@ -122,6 +121,8 @@ def test_far_scenes_pass_when_the_user_says_so():
     with pytest.raises(DataError, match="500 m"):
         require_plausible("v", np.full(9, 500, np.float32), 1.0, asked=False)
     require_plausible("v", np.empty(0, np.float32), 1.0, asked=False)
+    with pytest.raises(DataError, match="did you mean --depth-scale 100, which makes it 1.2 m"):  # centimeters
+        require_plausible("v", np.full(9, 120, np.float32), 1.0, asked=False)
 
 
 def test_the_units_of_a_calibration_are_used_unless_others_are_given(tmp_path):
@@ -138,12 +139,27 @@ def test_the_units_of_a_calibration_are_used_unless_others_are_given(tmp_path):
     )
 
 
-@pytest.mark.parametrize(("mark", "largest", "told"), [(2047, 1100, True), (4095, 3000, True), (2047, 2046, False)])
-def test_the_largest_number_of_a_sensors_bits_is_told_where_it_seems_a_mark(tmp_path, mark, largest, told):
-    frame = np.linspace(500, largest, 48 * 64).reshape(48, 64).astype("u2")
+@pytest.mark.parametrize(
+    ("kind", "mark", "largest", "told"),
+    [
+        ("u2", 2047, 1100, True),
+        ("u2", 4095, 3000, True),
+        ("u2", 2047, 2046, False),
+        ("u2", 60000, 3000, True),
+        ("u2", 3000, 1100, False),  # a wall
+        ("u1", 255, 120, True),
+        ("u1", 255, 253, False),
+        ("f4", 1000, 3, True),
+        ("f4", 5, 3, False),
+    ],
+)
+def test_the_largest_number_is_told_where_it_seems_a_mark(tmp_path, kind, mark, largest, told):
+    frame = np.linspace(largest / 3, largest, 48 * 64).reshape(48, 64).astype(kind)
     frame[5:15] = mark
     notes = sample_of(tmp_path / "a.npy", np.stack([frame, frame]), fov=57).notes
     assert any(f"many pixels hold {mark}" in note for note in notes) == told
+    notes = sample_of(tmp_path / "a.npy", np.stack([frame, frame]), fov=57, far=30.0).notes
+    assert not any("many pixels hold" in note for note in notes)
 
 
 def test_folders_that_links_name_are_entered_but_those_above_are_not(tmp_path):

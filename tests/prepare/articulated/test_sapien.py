@@ -164,6 +164,13 @@ def test_mimic_joints_follow(tmp_path):
         ([joint("j", "a", "b", axis="0, 0, 1")], "joint 'j': xyz='0, 0, 1' of <axis>; expected 3 numbers"),
         ([joint("j", "a", "b", more='<mimic joint="k" offset="1e"/>')], "offset='1e' of <mimic>; expected 1 number,"),
         ([link("a", '<mesh filename="m.stl" scale="1 1"/>')], "scale='1 1' of <mesh>; expected 1 or 3 numbers"),
+        ([link("a", '<box size="1 nan 1"/>')], "link 'a': size='1 nan 1' of <box>; expected 3 numbers"),
+        ([link("a", box(1, 1, 1), "inf 0 0")], "link 'a': xyz='inf 0 0' of <origin>; no robot is that large"),
+        ([joint("j", "a", "b", limits="nan 1")], "joint 'j': lower='nan' of <limit>; expected 1 number"),
+        (
+            [joint("j", "a", "b", more='<mimic joint="k" multiplier="1e12"/>')],
+            "multiplier='1e12' of <mimic>; no robot is that large",
+        ),
         (['<link name="a"><visual/></link>'], "link 'a' has a <visual> without geometry; expected box"),
         (['<link name="a"><visual><geometry/></visual></link>'], "link 'a' has a <visual> without geometry"),
         ([link("a", '<box size="1 1 1"/><sphere radius="1"/>')], "link 'a' has 2 shapes in one <visual>"),
@@ -243,6 +250,13 @@ def test_layouts(tmp_path):
         ("Safe_7_000", 0),
         ("Safe_7_001", 0),
     ]
+    linked = tmp_path / "linked"
+    cabinet(linked / "1" / "mobility.urdf")
+    (linked / "2").symlink_to(flat / "7")
+    (linked / "3").symlink_to(linked / "1")
+    assert [i.name for i in Sapien(linked, 1, allow_outside=True).items()] == ["1_000", "3_000", "Safe_2_000"]
+    (problem,) = [i.problem for i in Sapien(linked, 1).items() if i.problem]
+    assert "linked/2/mobility.urdf: 'mobility.urdf' lies outside the folder" in problem
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="no URDF found; expected a .urdf file, or a folder of objects"):
         find_objects(tmp_path / "empty")
@@ -309,6 +323,13 @@ def test_a_limit_that_is_left_out_is_zero(limits, expected, kind, tmp_path):
     moving = joint("j", "a", "b", kind=kind, limits="", more=f'<limit {limits} effort="1" velocity="1"/>')
     path = write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), link("b", box(1, 1, 1)), moving)
     assert (load(path).joints[0].lower, load(path).joints[0].upper) == expected
+
+
+def test_angles_that_look_like_degrees_are_noted_and_fixed_joints_need_no_axis(tmp_path):
+    assert not load(two(tmp_path, rpy="0 0 6.2832")).notes
+    assert "more than one turn (are they degrees?" in str(load(two(tmp_path, rpy="0 0 90")).notes)
+    fixed = joint("k", "b", "c", kind="fixed", axis="nan nan nan", limits="nan nan")
+    assert load(two(tmp_path, link("c", box(1, 1, 1)), fixed)).num_bodies == 2
 
 
 @settings(max_examples=15, derandomize=True, deadline=None)

@@ -103,10 +103,18 @@ def test_ranges_of_color(values, expected):
     assert found.dtype == np.uint8 and found.tolist() == [expected]
 
 
-@pytest.mark.parametrize("values", [[[-1.0, 0, 0]], [[np.nan, 0, 0]], [[256.0, 3, 4]], [[1e6, 0, 0]], [[1.4, 0.5, 0]]])
+@pytest.mark.parametrize(
+    "values", [[[-1.0, 0, 0]], [[np.nan, 0, 0]], [[256.0, 3, 4]], [[1e6, 0, 0]], [[1.4, 0.5, 0]], [[3.5, 0, 0]]]
+)
 def test_colors_of_no_range_are_refused(values):
     with pytest.raises(DataError, match="expected 0 to 255, fractions from 0 to 1, or 16 bits"):
         as_bytes([np.float64(values)])
+
+
+def test_frames_of_different_ranges_of_color_are_refused():
+    with pytest.raises(DataError, match="from 0 to 1 in some frames and to 255 in others"):
+        as_bytes([np.float64([[1, 0.5, 0]]), np.float64([[255, 128, 0]])])
+    assert as_bytes([np.float64([[1, 0, 0]]), np.float64([[255, 128, 0]])])[0].tolist() == [[1, 0, 0]]
 
 
 def scan(columns: int, count: int, seed: int) -> np.ndarray:

@@ -132,6 +132,18 @@ def test_degrees_are_no_lengths(tmp_path, told):
         read_las(tmp_path / "a.las")
 
 
+def test_degrees_that_no_reference_system_tells(tmp_path):
+    points = np.array([[8.5, 47.3, 400], [8.6, 47.2, 410]])
+    las = make(3, points)
+    las.header.scales = [1e-7, 1e-7, 1e-2]
+    las.x, las.y, las.z = points.T
+    las.write(str(tmp_path / "a.las"))
+    with pytest.raises(DataError, match="longitudes and latitudes in degrees"):
+        read_las(tmp_path / "a.las")
+    make(3, points, 1e-7).write(str(tmp_path / "b.las"))  # a fine scanner
+    np.testing.assert_allclose(read_las(tmp_path / "b.las").points, points, atol=1e-7)
+
+
 def test_withheld_points_are_dropped_and_counted(tmp_path):
     las = make(6, np.arange(30.0).reshape(10, 3))
     las.withheld = np.arange(10) < 3

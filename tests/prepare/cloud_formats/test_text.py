@@ -255,6 +255,34 @@ def test_one_frame_of_a_table_is_a_cloud(tmp_path):
     assert read(tmp_path / "a.csv", "frame,x,y,z\n7,1,2,3\n7,4,5,6\n").points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+PLY = "ply\nformat ascii 1.0\n{}element vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+PCD = "{}VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("comment", "unit"),
+    [
+        ("Units: mm", "mm"),
+        ("coordinates are in feet", "ft"),
+        ("unit = Meter", "m"),
+        ("made with a unit test", ""),
+        ("units: none", ""),
+        ("", ""),
+    ],
+)
+def test_units_that_comments_tell(tmp_path, comment, unit):
+    for name, text in (
+        ("a.ply", PLY.format(f"comment {comment}\n")),
+        ("b.ply", PLY.format(f"obj_info {comment}\n")),
+        ("a.pcd", PCD.format(f"# {comment}\n")),
+        ("a.xyz", f"# {comment}\n1 2 3\n"),
+        ("a.csv", f"# {comment}\nx,y,z\n1,2,3\n"),
+    ):
+        (tmp_path / name).write_text(text)
+        cloud = read_cloud(tmp_path / name)
+        assert cloud.unit == unit and cloud.points.tolist() == [[1, 2, 3]]
+
+
 def test_bytes_that_are_no_text(tmp_path):
     (tmp_path / "a.txt").write_bytes(bytes(range(256)) * 4)
     with pytest.raises(DataError, match="a.txt: not text"):
@@ -280,12 +308,30 @@ def test_bytes_that_are_no_text(tmp_path):
         ("x [µm]|y [µm]|z [µm]", [0, 1, 2], "um"),
         ("x_um y_um z_um", [0, 1, 2], "um"),
         ("x [dm]|y [dm]|z [dm]", [0, 1, 2], "dm"),
+        ('x (")|y (")|z (")', [0, 1, 2], "in"),
         ("x in mm|y in mm|z in mm", [0, 1, 2], "mm"),
         ("X-Koord. [m]|Y-Koord. [m]|Z-Koord. [m]|Höhe [cm]", [0, 1, 2], "m"),
     ],
 )
 def test_styles_of_headers(names, places, unit):
     assert find_axes(names.split("|") if "|" in names else names.split()) == (places, unit)
+
+
+@pytest.mark.parametrize(
+    ("header", "cell", "color"),
+    [
+        ("rgb", str(0x0A141E), [10, 20, 30]),
+        ("rgb", repr(float(np.array([0x0A141E], "u4").view("f4")[0])), [10, 20, 30]),  # as PCL has them
+        ("rgb", repr(float(np.array([0xFE0A141E], "u4").view("f4")[0])), [10, 20, 30]),
+        ("rgb", "0.5", None),
+        ("r [%],g [%],b [%]", "100,50,0", None),
+    ],
+)
+def test_colors_in_one_column_and_in_percent(tmp_path, header, cell, color):
+    (tmp_path / "a.csv").write_text(f"x,y,z,{header}\n1.5,2,3,{cell}\n")
+    cloud = read_text(tmp_path / "a.csv")
+    assert (cloud.color is None and cloud.unread == tuple(header.split(","))) if color is None else True
+    assert color is None or cloud.color.tolist() == [color]
 
 
 def test_names_that_mean_something_else():

@@ -72,6 +72,26 @@ def test_many_files_are_not_all_open_at_once(tmp_path, monkeypatch):
     files.close()
 
 
+def test_objects_of_few_and_of_many_parts_are_joined(tmp_path):
+    paths = [tmp_path / "two.h5", tmp_path / "four.h5"]
+    for path, parts in zip(paths, (2, 4)):
+        with CloudsWriter(path, provenance={"config": {}}, fields=("part", "pose", "joint")) as writer:
+            points, part = np.ones((4, 3), np.float32), np.arange(4, dtype=np.int16) % parts
+            pose, joint = np.full((1, parts, 4, 4), 0.5), np.full((1, parts, 9), 1.0)
+            writer.write(CloudSequence.from_frames(path.stem, [points], part=[part], pose=pose, joint=joint))
+    for order in (paths, paths[::-1]):
+        merge(order, tmp_path / "all.h5", force=True, labels=LabelMap())
+        with CloudsReader(tmp_path / "all.h5") as whole:
+            few = whole.read(whole.names.index("two"))
+            assert (
+                few.pose.shape == (1, 4, 4, 4)
+                and (few.pose[0, :2] == 0.5).all()
+                and (few.pose[0, 2:] == np.eye(4)).all()
+            )
+            assert (few.joint[0, :2] == 1).all() and few.joint[0, 2:].tolist() == [[-1.0, *[0.0] * 8]] * 2
+            assert (whole.read(whole.names.index("four")).pose == 0.5).all()
+
+
 def test_a_label_map_joins_unlike_classes(two, tmp_path):
     text = '[labels]\n"push" = "shove"\n"bend" = ""\n[files."b.h5"]\n"g1" = "shove"\n"g2" = "hand wave"\n'
     (tmp_path / "map.toml").write_text(text)

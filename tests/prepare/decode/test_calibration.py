@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.calibration import Calibration, read_calibration
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics, pixel_rays
+from dpcli.prepare.decode.calibration import read_calibration
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics, pixel_rays
 
 FX, FY, CX, CY = 610.0, 609.5, 325.25, 237.75
 CAMERA = Intrinsics(FX, FY, CX, CY)
@@ -125,6 +125,12 @@ def test_matrices_of_numpy_and_opencv(tmp_path):
         ("depth_units", 0.001, 1000),
         ("scale", 6553.5, 6553.5),
         ("depth_unit", "mm", 1000),
+        ("depthScaleFactor", 10000, 10000),
+        ("Depth Scale", 0.0001, 10000),
+        ("depthUnitsMeters", 0.0001, 10000),
+        ("DepthScale(mm)", 0.1, 10000),
+        ("depth_units_per_meter", 10000, 10000),
+        ("depth_to_m", 0.0001, 10000),
     ],
 )
 def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, value, scale):
@@ -132,6 +138,89 @@ def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, va
     found = read_calibration(tmp_path / "k.json")
     assert found.depth_scale == pytest.approx(scale)
     found.require_clear_scale()
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"imageWidth": 640, "imageHeight": 480},
+        {"cols": 640, "rows": 480},
+        {"resolution": "640x480"},
+        {"image_size": [640, 480]},
+        {"ImageSize": [480, 640]},  # rows first, as MATLAB has it
+        {"image_dimensions": {"width": 640, "height": 480}},
+        {"color_width": 640, "color_height": 480},
+        {"color_width": 1280, "color_height": 960, "depth_width": 640, "depth_height": 480},
+        {"resolution_width": 640, "resolution_height": 480, "max_width": 9},
+    ],
+)
+def test_every_name_of_the_size_of_pictures(tmp_path, size):
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, **size}))
+    found = read_calibration(tmp_path / "k.json")
+    assert (found.width, found.height) == (640, 480) and found.intrinsics == CAMERA
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"# fx cx fy cy\n{FX} {CX} {FY} {CY}\n",
+        f"fx cx fy cy\n{FX} {CX} {FY} {CY}\n",
+        f"#fx,fy,cx,cy,width,height\n{FX},{FY},{CX},{CY},640,480\n",
+        f"fx = {FX};\nfy = {FY};\ncx = {CX};\ncy = {CY};\n",
+    ],
+)
+def test_names_tell_the_order_of_numbers(tmp_path, text):
+    (tmp_path / "k.txt").write_text(text)
+    assert read_calibration(tmp_path / "k.txt").intrinsics == CAMERA
+    (tmp_path / "k.txt").write_text(f"{FX} {CX} {FY} {CY}\n")
+    with pytest.raises(DataError, match="focal lengths 610 and 325.25; expected fx fy cx cy, in this order"):
+        read_calibration(tmp_path / "k.txt")
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_a_principal_point_of_another_size_is_refused(factor):
+    camera = Intrinsics(300, 300, 320 * factor - 0.5, 240 * factor - 0.5)
+    with pytest.raises(DataError, match="seems to be of another size than these 640x480 pictures"):
+        Calibration(camera).of_pictures(640, 480)
+    assert Calibration(camera, 640, 480).of_pictures(640, 480) == camera  # such as of a cut-out
+    assert Calibration(Intrinsics(300, 300, 500, 240)).of_pictures(640, 480)
+
+
+def test_what_only_sounds_like_a_depth_scale_is_none_and_two_that_differ_are_refused(tmp_path):
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_max": 4, "depth_to_color": [1], "unit": 2}))
+    assert read_calibration(tmp_path / "k.json").depth_scale is None
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_scale": 1000, "depthUnits": 0.0001}))
+    with pytest.raises(DataError, match="depth_scale and depthunits give different depth scales .1000, 10000 raw"):
+        read_calibration(tmp_path / "k.json")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"depthIntrinsic": PLAIN, "depthDistortion": {"k1": 0.2, "k2": 0.0}, "rgbDistortion": {"k1": 0.9}},
+        {"intrinsics": PLAIN, "distortion": {"model": "plumb_bob", "k1": 0.2}},
+        {"depth": {"intrinsics": PLAIN, "distortion_coefficients": [0.2, 0, 0, 0, 0]}},
+    ],
+)
+def test_the_lens_may_stand_beside_the_camera(tmp_path, content):
+    (tmp_path / "k.json").write_text(json.dumps(content))
+    found = read_calibration(tmp_path / "k.json").intrinsics
+    assert isinstance(found, LensIntrinsics) and found.distortion[0] == 0.2
+    (tmp_path / "k.json").write_text(json.dumps(content).replace("plumb_bob", "kannala_brandt4"))
+    if "model" in str(content):
+        with pytest.raises(DataError, match="model kannala_brandt4"):
+            read_calibration(tmp_path / "k.json")
+
+
+def test_a_lens_that_a_text_names_and_numbers_of_a_german_table(tmp_path):
+    lines = "PPX: 325\nPPY: 237\nFx: 600\nFy: 601\nDistortion: {}\nCoeffs: 0.1 0 0 0 0\n"
+    (tmp_path / "k.txt").write_text(lines.format("Brown Conrady"))
+    assert read_calibration(tmp_path / "k.txt").intrinsics.distortion[0] == 0.1
+    (tmp_path / "k.txt").write_text(lines.format("Inverse Brown Conrady"))
+    with pytest.raises(DataError, match="model inverse_brown_conrady"):
+        read_calibration(tmp_path / "k.txt")
+    (tmp_path / "k.csv").write_text("fx;fy;cx;cy\n" + ";".join(str(PLAIN[k]) for k in PLAIN).replace(".", ","))
+    assert read_calibration(tmp_path / "k.csv").intrinsics == CAMERA
 
 
 def test_a_depth_scale_that_may_mean_two_things_is_refused_where_it_counts(tmp_path):

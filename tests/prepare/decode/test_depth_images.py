@@ -156,5 +156,5 @@ def test_an_array_whose_frames_come_first_is_read(tmp_path, shape):
 @pytest.mark.parametrize("name", ["0.png", "0.tif", "0.npy", "0.mp4"])
 def test_what_stands_in_for_a_file_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
-    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; fetch the file itself: git lfs pull"):
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
         read_depth_video(tmp_path if name.endswith(("png", "tif")) else tmp_path / name)

@@ -122,6 +122,17 @@ def test_the_back_of_a_surface_shows_only_where_the_file_says_so(tmp_path):
     assert look(load(file, tmp_path))[32, 32].tolist() == [255, 255, 255, 255]
 
 
+def test_tiny_models_are_seen_and_lit_and_unknown_words_for_alpha_are_none(tmp_path):
+    """A unit of a millionth of a millionth of a millionth of a meter, and a word that viewers take for opaque."""
+    file = quad()
+    file.tree["nodes"][0]["scale"] = [1e-18] * 3
+    file.tree["materials"] = [{"alphaMode": "TRANSPARENT", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.5]}}]
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = file.add(np.tile([0, 0, 1.0], (4, 1)))
+    mesh = load(file, tmp_path)
+    np.testing.assert_allclose(mesh.normals, np.tile([0, 0, 1.0], (1, 4, 1)))
+    assert (look(normalized(mesh, 0.75))[32, 32] == 255).all()
+
+
 def test_a_mirrored_node_keeps_its_front(tmp_path):
     file = quad()
     file.tree["nodes"][0]["scale"] = [-1, 1, 1]

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.decode.calibration import Calibration
-from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
 from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED
@@ -273,6 +272,42 @@ def test_what_a_user_gives_comes_before_what_the_recording_says(tmp_path):
     np.testing.assert_allclose(first[0] / first[2], -8 / 100, rtol=1e-6)
     bare = write_recording(tmp_path / "bare", "mcap", make, [("/color/camera_info", START, content[0][2]), content[1]])
     assert any("without camera_info" in note for note in read(DepthVideos(inputs=(bare,))).notes)
+
+
+def test_recordings_of_a_realsense_have_its_camera_and_its_units(tmp_path):
+    make, sensor = Messages("bag"), "/device_0/sensor_0"
+    units = [make.make("std_msgs/msg/Float32", data=value) for value in (0.0001, 0.001)]
+    content = [
+        ("/device_0/sensor_1/Color_0/info/camera_info", START, make.camera([9.0, 0, 8, 0, 9, 6, 0, 0, 1], 16, 12)),
+        (f"{sensor}/Depth_0/info/camera_info", START, make.camera(K, 16, 12)),
+        (f"{sensor}/option/Depth_Units/value", START, units[0]),
+        ("/device_0/sensor_1/option/Depth_Units/value", START, units[1]),
+        (f"{sensor}/Depth_0/image/data", START, make.image(depth16(), encoding="mono16")),
+    ]
+    path = write_recording(tmp_path / "run", "bag", make, content)
+    meters = depth16().reshape(-1) / 10_000
+    points = read(DepthVideos(inputs=(path,))).sequence.points
+    np.testing.assert_allclose(points[:, 2], meters, rtol=1e-6)
+    np.testing.assert_allclose(points[0, :2], [-8 / 500 * meters[0], -6 / 510 * meters[0]], rtol=1e-5)
+    np.testing.assert_allclose(
+        read(DepthVideos(inputs=(path,), depth_scale=2000)).sequence.points[:, 2], meters * 5, rtol=1e-6
+    )
+    path = write_recording(tmp_path / "two", "bag", make, [*content, (content[2][0], START + 1, units[1])])
+    with pytest.raises(DataError, match=r"Depth_Units/value changes on the way \(0.0001, 0.001\)"):
+        read(DepthVideos(inputs=(path,)))
+
+
+def test_of_several_camera_infos_the_one_that_says_depth_counts(tmp_path):
+    make = Messages("mcap")
+    image = ("/robot/depth", START, make.image(np.full((12, 16), 1000, np.uint16)))
+    infos = {name: make.camera([k, 0, 8, 0, k, 6, 0, 0, 1], 16, 12) for name, k in (("rgb", 100.0), ("depth", 500.0))}
+    content = [(f"/robot/{name}_camera_info", START, info) for name, info in infos.items()]
+    path = write_recording(tmp_path / "run", "mcap", make, [*content, image])
+    np.testing.assert_allclose(read(DepthVideos(inputs=(path,))).sequence.points[0, 0], -8 / 500, rtol=1e-6)
+    path = write_recording(
+        tmp_path / "two", "mcap", make, [(f"/robot/{k}", START, infos["rgb"]) for k in "ab"] + [image]
+    )
+    assert any("without camera_info of their depth" in note for note in read(DepthVideos(inputs=(path,))).notes)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item
 from dpcli.prepare.scans.assembling import COARSE, Lengths, assemble
-from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
+from dpcli.prepare.scans.cleaning import AT_ORIGIN, CROWDED, IMPOSSIBLE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.runtime.machines.shards import Shard
 from dpcli.store import CloudsReader
@@ -37,6 +37,8 @@ def convert_folder(folder, path, **options):
     [
         ([0.0, 0, 0], AT_ORIGIN),
         ([-0.0, 0, 0], AT_ORIGIN),
+        ([1e-9, -1e-9, 0], AT_ORIGIN),  # what turning leaves of 0
+        ([1.17549435e-38] * 3, AT_ORIGIN),
         ([1e30, 1, 1], IMPOSSIBLE),
         ([-3.4e38, 0, 0], IMPOSSIBLE),
         ([-9999.0] * 3, IMPOSSIBLE),
@@ -51,6 +53,14 @@ def test_points_that_nobody_measured(bad, reason):
     assert clean([cloud]) == {reason: 3}
     np.testing.assert_array_equal(cloud.points, POINTS)
     assert cloud.extra["v"].tolist() == [*range(5), *range(8, 23)]
+
+
+def test_many_points_at_one_place_are_told():
+    place = [[0.0, 0.0, 1.73]] * 10  # where the sensor of a vehicle stands
+    for points, told in ((np.vstack([POINTS, place]), True), (np.vstack([POINTS, place[:5]]), False)):
+        flat = np.column_stack([np.repeat(POINTS[:, 0], 20), np.arange(400), np.arange(400)])  # one x, not one place
+        clouds = [Cloud(points), Cloud(np.vstack([flat, points]))]
+        assert (CROWDED in assemble(Item("a", Path("a")), clouds, Lengths()).notes) == told
 
 
 def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
@@ -116,6 +126,8 @@ def test_shards_and_merges_keep_shifts(tmp_path):
         ((POINTS - 1) * 4000, "if these are millimeters, give --scale 1000"),
         ((POINTS + 1) * 1000, "if these are millimeters, give --scale 1000"),
         ((POINTS * 100).round(), "whole numbers, hardly meters; if they are millimeters, give --scale 1000"),
+        (POINTS * (1e-3, 1e-3, 9) + (8.4, 49, 115), "are these degrees?"),
+        (POINTS * (1e-3, 1e-3, 9), ""),  # a pole around which the axes stand
         (POINTS.round(), ""),
         (POINTS * 1000 + 448_000, ""),
         (POINTS * 100 - 80, ""),

@@ -244,8 +244,15 @@ def test_a_missing_open3d_is_explained(monkeypatch):
 def test_what_else_lies_there_is_named(tmp_path):
     save(tmp_path / "a" / "0.ply")
     (tmp_path / "a" / "0.e57").write_bytes(b"ASTM-E57")
+    (tmp_path / "a" / "0.bag").write_bytes(b"#ROSBAG V2.0")
     reader = CloudFolders(tmp_path)
-    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .e57 file"
+    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .bag file, 1 .e57 file"
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "0.bag.active").touch()
+    with pytest.raises(DataError, match="found 1 .active file: end the recording, or repair it by `rosbag reindex`"):
+        CloudFolders(tmp_path / "b").items()
+    for rest in ("a/0.bag", "b/0.bag.active"):
+        (tmp_path / rest).unlink()
     (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
     with pytest.raises(DataError, match="found 1 .e57 file, 1 .gz file: save their points as .ply, .*, or unpack them"):
         CloudFolders(tmp_path).items()
@@ -260,7 +267,7 @@ def test_what_else_lies_there_is_named(tmp_path):
 @pytest.mark.parametrize("name", ["0.ply", "0.pcd", "0.las", "0.npy", "0.bin", "0.csv", "0.npz"])
 def test_what_stands_in_for_a_file_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
-    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; fetch the file itself: git lfs pull"):
+    with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
         read_cloud(tmp_path / name)
     (tmp_path / name).write_bytes(b"<!DOCTYPE html>\n<html><body>Sign in</body></html>")
     with pytest.raises(DataError, match=f"{name}: a web page; download it again"):
@@ -275,6 +282,28 @@ def test_texts_of_a_vehicles_sensors_are_no_clouds(tmp_path):
     assert [item.name for item in reader.items()] == ["velodyne/data"]
     assert "left out: label_2/0.txt, oxts/data/0.txt" in reader.summary(reader.items())[1]
     assert len(CloudFolders(tmp_path / "oxts").items()) == 1  # who names it, gets it
+
+
+def test_one_text_above_the_clouds_and_arrays_of_normals_are_no_clouds(tmp_path):
+    for folder in ("00/velodyne", "00/normals", "00/b"):
+        save(tmp_path / folder / "0.npy")
+    (tmp_path / "00" / "instances.txt").write_text("1 2 3\n4 5 6\n")
+    reader = CloudFolders(tmp_path)
+    assert [item.name for item in reader.items()] == ["00/b", "00/velodyne"]
+    assert "left out: 00/instances.txt, 00/normals/0.npy" in reader.summary(reader.items())[1]
+    save(tmp_path / "00" / "normals" / "1.npy")  # other frames: a sequence of that name
+    assert [item.name for item in CloudFolders(tmp_path).items()] == ["00/b", "00/normals", "00/velodyne"]
+
+
+def test_folders_that_may_each_be_a_moment_are_told(tmp_path):
+    for k in range(3):
+        for camera in "ab":
+            save(tmp_path / "raw" / f"t{k:04d}" / f"{camera}.npy")
+    reader = CloudFolders(tmp_path / "raw")
+    told = "3 folders such as t0000 hold a.npy, b.npy each: if a folder is one moment"
+    assert told in reader.summary(reader.items())[-1]
+    save(tmp_path / "raw" / "t0001" / "c.npy")
+    assert told not in "".join((again := CloudFolders(tmp_path / "raw")).summary(again.items()))
 
 
 @pytest.mark.parametrize(

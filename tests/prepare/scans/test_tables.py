@@ -196,6 +196,20 @@ def test_columns_that_are_not_there(tmp_path, options, message):
     assert message in item.problem
 
 
+def test_files_that_only_seem_tables_are_named(tmp_path):
+    (tmp_path / "a.xlsx").write_bytes(b"PK\3\4")
+    with pytest.raises(DataError, match=".xlsx files are not read: save their sheets as .csv"):
+        TableSequences(tmp_path / "a.xlsx", frame_column="frame").items()
+    (tmp_path / "a.csv").write_text("<html><body>sign in</body></html>")
+    assert "a web page; download it again" in TableSequences(tmp_path / "a.csv").items()[0].problem
+
+
+def test_a_word_among_the_numbers_of_frames_is_none(tmp_path):
+    path = write(tmp_path / "a.csv", [*frames(0, 1), ("Mean", 1, 2, 3)])
+    (item,) = TableSequences(path).items()
+    assert "a.csv:6: column 'frame' holds 'Mean'; expected numbers" in item.problem
+
+
 def test_tables_that_cannot_be_split(tmp_path):
     (item,) = TableSequences(write(tmp_path / "0.csv", [], "frame,x,y,z")).items()
     assert "a header, but no rows" in item.problem

@@ -37,6 +37,8 @@ def csv(path, header, rows):
         ("time [ticks]", [0.5, 0.75], None),
         ("timestamp", [1_234_567_890, 1_234_617_890], None),  # microseconds since the sensor began
         ("timestamp", [1_700_000_000, 1_700_000_030], [0, 30]),
+        ("timestamp", [1_700_000_000_000.5, 1_700_000_000_050.5], [0, 0.05]),
+        ("t", [0.5, 50.5], [0, 50]),
         ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
         ("time", ["11:59:59 AM", "12:00:00.5 pm"], [0, 1.5]),
         ("time", [45356.5, 45356.500001157], None),  # days, as spreadsheets count them
@@ -52,6 +54,20 @@ def test_units_in_the_names_of_times(tmp_path, name, values, expected):
         assert sequence.time is None and name in about.split("not read: ")[1]
     else:
         np.testing.assert_allclose(sequence.time, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "fps", "expected"),
+    [
+        ("time", [0, 33, 67, 100], 30, [0, 0.033, 0.067, 0.1]),
+        ("t", [5_000_000, 5_100_000, 5_200_000], 10, [0, 0.1, 0.2]),
+        ("t", [0, 1, 2, 5], 10, [0, 0.1, 0.2, 0.5]),
+        ("frame", [0, 33, 66], 30, [0, 1 / 30, 2 / 30]),
+    ],
+)
+def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values, fps, expected):
+    path = csv(tmp_path / "a.csv", f"{name},x,y,z", [(value, 1, 2, k) for k, value in enumerate(values)])
+    np.testing.assert_allclose(only_sequence(path, frame_column=name, fps=fps)[0].time, expected, atol=1e-6)
 
 
 def test_a_column_of_days_numbers_frames_by_their_rate(tmp_path):

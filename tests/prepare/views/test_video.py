@@ -682,6 +682,7 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
             "a focal length of 1.04 pixels for pictures of 64x48; expected pixels, not shares",
         ),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
+        (lambda d: d.update(camera_angle_x=1e-9), "a focal length of 6.4e.10 pixels .* no camera sees so little"),
         (lambda d: d.update(cx=0.5, cy=0.52), "a principal point at 0.5, 0.52; expected pixels, not shares"),
         (lambda d: d.update(distortion_params=[0.1, 0, 0, 0]), "distortion_params .0.1, 0, 0, 0.; expected pictures"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),

@@ -305,6 +305,22 @@ def test_what_no_picture_of_a_gif_covers_is_clear_as_in_browsers(tmp_path):
     ]
 
 
+def test_what_no_picture_of_a_webp_covers_is_clear_as_in_browsers(tmp_path):
+    """Pillow marks a file as without alpha where every picture in it is opaque, though they are smaller than the canvas."""
+    frames = np.zeros((3, 8, 12, 4), np.uint8)
+    for t, frame in enumerate(frames):
+        frame[2:6, 2 + 2 * t : 6 + 2 * t] = (200, 30, 40, 255)
+    first, *others = map(Image.fromarray, frames)
+    first.save(tmp_path / "a.webp", save_all=True, append_images=others, duration=100, lossless=True)
+    assert not (tmp_path / "a.webp").read_bytes()[20] & 16
+    np.testing.assert_array_equal(list(open_frames(tmp_path / "a.webp").read(range(3))), frames)
+    whole = [Image.fromarray(np.full((4, 4), level, np.uint8)) for level in (9, 200)]
+    whole[0].save(tmp_path / "b.webp", save_all=True, append_images=whole[1:], duration=100, lossless=True)
+    assert np.stack(list(open_frames(tmp_path / "b.webp").read(range(2))))[..., [0, 3]].reshape(2, -1, 2)[
+        :, 0
+    ].tolist() == [[9, 255], [200, 255]]
+
+
 def test_a_canvas_that_a_gif_cannot_fill_is_refused_before_it_is_laid_out(tmp_path):
     frames = [Image.fromarray(np.full((8, 8), level, np.uint8)) for level in (0, 255)]
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:], duration=100)

@@ -7,6 +7,7 @@ import struct
 import zlib
 
 import numpy as np
+import PIL
 import pytest
 from PIL import Image
 
@@ -138,10 +139,26 @@ def test_white_at_0_and_alpha_in_the_gray_of_a_tiff_are_read(tmp_path):
         "up.tif": (tiff_of(gray[..., None].astype(np.uint16) * 257, 1), 255),
         "la.tif": (tiff_of(np.dstack([np.rint(gray / 5).astype(np.uint8), clear]), 1, 1), 51),
     }
+    if int(PIL.__version__.split(".")[0]) < 13:  # which reads no gray with alpha from TIFF
+        (tmp_path / "la.tif").write_bytes(cases.pop("la.tif")[0])
+        with pytest.raises(DataError, match="la.tif: not a readable image"):
+            read_rgba(tmp_path / "la.tif")
     for name, (data, alpha) in cases.items():
         (tmp_path / name).write_bytes(data)
         read = read_rgba(tmp_path / name).astype(int)
         assert (read[..., 3] == alpha).all() and np.abs(read[..., 0] - gray).max() <= (3 if alpha < 255 else 0), name
+
+
+def test_a_channel_of_a_tiff_that_may_be_alpha_is_told_when_it_is_not_read(tmp_path, capsys):
+    """Pillow takes four samples of which the last has no meaning for three; straight and multiplied alpha it reads."""
+    Image.fromarray(np.full((8, 8, 4), 100, np.uint8)).save(tmp_path / "a.tif")
+    data, tag = (tmp_path / "a.tif").read_bytes(), struct.pack("<HHI", 338, 3, 1)
+    assert data.count(tag) == 1
+    for extra, color, alpha in ((0, 100, 255), (1, 255, 100), (2, 100, 100)):
+        (tmp_path / "a.tif").write_bytes(data.replace(tag + b"\2", tag + bytes([extra])))
+        read = read_rgba(tmp_path / "a.tif")
+        assert (read == (color, color, color, alpha)).all(), extra
+        assert ("further channel" in capsys.readouterr().err) == (extra == 0)
 
 
 def with_chunk(png: bytes, name: bytes, data: bytes) -> bytes:

@@ -166,7 +166,7 @@ def test_a_clip_that_begins_late_is_whole(pictures, tmp_path, name):
 def test_a_truncated_clip_is_no_trimmed_one(pictures, tmp_path):
     path = film(pictures, tmp_path / "t.mp4", *PLAIN, "-g", 2, "-movflags", "+faststart", "-qp", 0)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.75)])
-    with pytest.raises(DataError, match="truncated or damaged"):
+    with pytest.raises(DataError, match="truncated(,| or damaged)"):  # PyAV before 18 gives none of its frames
         look_at_video(path)
 
 

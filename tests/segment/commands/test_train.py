@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 from typer.testing import CliRunner
 
 from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.store import CloudsWriter
+from dpcli.text_files import read_toml
 from tests.support.drawers import TRAIN, drawer
 
 
@@ -129,9 +129,15 @@ def test_a_wrong_choice_is_named_before_anything_is_made(words, said, dpc_here, 
     assert not (tmp_path / "model").exists()
 
 
+def test_a_run_that_diverges_is_told(dpc_here, data, tmp_path):
+    done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, "--set", "lr=1e12")
+    said = done.stderr.decode()
+    assert done.returncode == 1 and "training diverged (epoch " in said and "with a smaller lr" in said, said
+
+
 def test_the_settings_beside_the_weights_make_the_same_run(dpc_here, data, run_folder, tmp_path):
     """`settings.toml` alone continues the run; what it says was resolved from the preset and the options."""
-    said = tomllib.loads((run_folder / "settings.toml").read_text())
+    said = read_toml(run_folder / "settings.toml")
     assert said["network"]["sizes"] == "compact" and said["network"]["points"] == 48
     assert said["schedule"]["pairs_per_epoch"] == 6 and said["objective"]["loss"] == "blended"
     words = ("--preset", "release", "--config", run_folder / "settings.toml", "--seed", 3)

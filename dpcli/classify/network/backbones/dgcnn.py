@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import batch_norm, linear
 
 from dpcli.classify.network.backbones.frame_graph import frame_graph, pool_edges
-from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
+from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage, require_frozen
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.layers import ClipLinear, SharedLayers
 from dpcli.classify.network.sync_norm import SyncNorm
@@ -237,7 +237,7 @@ class DGCNN(Backbone):
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Returns four stages of one layer, each on its own graph over all points (in input coordinates), and the logits."""
-        assert not self.training, "the dynamic stream reads a frozen static network"
+        require_frozen(self)
         group = groups[0]
         features, levels, stages = self.transform(group.points, group.idx), [], []
         for conv in self.convs:

@@ -108,6 +108,12 @@ def build_backbone(config: KinetConfig) -> nn.Module:
     return network
 
 
+def require_frozen(network: nn.Module) -> None:
+    """Raises RuntimeError while a network trains: the dynamic stream reads a static one's running statistics."""
+    if network.training:
+        raise RuntimeError("the dynamic stream reads a frozen static network; call eval() first")
+
+
 def clip_points(points: Tensor) -> tuple[Tensor, Tensor]:
     """Returns a batch of clips (B,T,P,3) as one cloud a clip: points (B,T*P,3) frame after frame, times (B,T*P)."""
     batch, frames, count = points.shape[:3]

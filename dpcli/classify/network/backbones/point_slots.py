@@ -22,6 +22,8 @@ _REACH = 3  # slots that a layer over time sees
 _STEPS = (1, 2, 4)  # between these slots, a layer each
 _DROPPED = 0.1  # after each layer over time
 _LEAST = 1e-12  # the probability that 0 is taken for
+_LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)  # of the quantiles of a slot
+_READ = 16  # numbers of each slot that are read at its place in the video
 _COPIES = 4  # of a clip: as it is, mirrored, reversed in time, and both
 
 
@@ -33,7 +35,7 @@ class PointSlots(Backbone):
     from: another kind of errors. A clip may be marked with the member that must not learn from it; that member alone
     classifies it then: so all videos train, and all are judged by a network that never saw them. Reads of the
     config: num_frames (slots), points_per_frame, widths (the layers of a point; the width of a slot), columns, members,
-    copies, dropout.
+    copies, slot_details, dropout.
     """
 
     def __init__(self, config: KinetConfig) -> None:
@@ -87,6 +89,10 @@ class _Member(nn.Module):
     With `copies` it learns from mirrored and reversed clips, too, as self-supervised label augmentation does (Lee et al.,
     2020): what a gesture becomes by them is not in a file, so each kind of copy has a classifier of its own, while all share
     the layers below, which thus see four times as many movements.
+
+    With `slot_details` it also sees quantiles of each slot's values, which a few points far off don't change as they do a mean or
+    a maximum, and its classifier reads a few numbers of each slot at its place in the video: the mean and the maximum over
+    all slots forget when something happened. Speeds in the columns make up for it, places alone don't.
     """
 
     def __init__(self, config: KinetConfig) -> None:
@@ -94,12 +100,15 @@ class _Member(nn.Module):
         first, second = config.widths[0]
         width = config.widths[1][0]
         self.points = nn.Sequential(*_layer(4 + len(config.columns), first), *_layer(first, second))
-        self.slots = nn.Sequential(*_layer(2 * second + 1, width))
+        quantiles = len(_LEVELS) * (3 + len(config.columns)) if config.slot_details else 0
+        self.slots = nn.Sequential(*_layer(2 * second + 1 + quantiles, width))
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
         self.over_time = nn.ModuleList(_TemporalConvolution(width, step) for step in _STEPS)
         self.copies, self.speeds = _COPIES if config.copies else 1, config.signed_columns
         self.dropout = nn.Dropout(config.dropout)
-        self.classify = ClipLinear(2 * width, self.copies * config.num_classes)
+        self.course = nn.Linear(width, _READ) if config.slot_details else None
+        read = _READ * config.num_frames if config.slot_details else 0
+        self.classify = ClipLinear(2 * width + read, self.copies * config.num_classes)
         self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
@@ -140,11 +149,28 @@ class _Member(nn.Module):
         values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)
         values, count = values.view(*clips.shape[:3], -1), (clips[..., 3:4] > 0).sum(2).to(values)
         pooled = [values.sum(2) / count.clamp(min=1), values.amax(2), torch.log1p(count)]  # values are not below 0
+        if self.course is not None:
+            pooled.append(slot_quantiles(clips))
         found = self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], -1) + self.position
         for layer in self.over_time:
             found = found + layer(found)
-        logits = self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
+        read = [found.mean(1), found.amax(1)]
+        if self.course is not None:
+            read.append(self.course(found).flatten(1))
+        logits = self.classify(self.dropout(torch.cat(read, -1)))
         return logits.unflatten(-1, (self.copies, -1))[torch.arange(len(clips), device=clips.device), kinds]
+
+
+def slot_quantiles(clips: Tensor) -> Tensor:
+    """Returns five quantiles of the places and columns of each slot's points, f32 (B,T,5(3+F)), of clips (B,T,P,5+F); 0 where a
+    slot has no point."""
+    there = clips[..., 3:4] > 0
+    values = torch.cat([clips[..., :3], clips[..., 5:]], -1)
+    ordered = torch.where(there, values, values.new_tensor(float("inf"))).sort(2).values
+    last = there.sum(2, keepdim=True) - 1
+    places = torch.cat([(level * last.clamp(min=0)).round().long() for level in _LEVELS], 2)
+    found = ordered.gather(2, places.expand(-1, -1, -1, values.shape[-1]))
+    return torch.where(last >= 0, found, torch.zeros_like(found)).flatten(2)
 
 
 class _TemporalConvolution(nn.Module):

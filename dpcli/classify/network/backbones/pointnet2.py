@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
+from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage, require_frozen
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.layers import GlobalHead, SharedLayers, he_init
 from dpcli.ops import fps, gather_points, space_time_ball_query
@@ -53,7 +53,7 @@ class SetAbstraction(SharedLayers):
 
     def taps(self, group: Grouping, features: Tensor | None) -> tuple[list[Tensor], Tensor]:
         """Returns both layers' activations before pooling with running statistics, (B,M,K,C1), (B,M,K,C2), and pooled, (B,M,C2)."""
-        assert not self.training, "the dynamic stream reads a frozen static network"
+        require_frozen(self)
         return frozen_activations(group.points, group.centers, group.idx, features, *self._arguments())
 
 

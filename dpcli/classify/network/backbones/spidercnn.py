@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from dpcli.classify.network.backbones.dgcnn import DenseHead, expect_widths, xavier_init
 from dpcli.classify.network.backbones.frame_graph import frame_graph
-from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
+from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage, require_frozen
 from dpcli.classify.network.config import KinetConfig
 from dpcli.ops import gather_points
 from dpcli.ops.backend import chosen_backend, run_in_threads
@@ -215,7 +215,7 @@ class SpiderCNN(Backbone):
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Returns four stages of one layer on the same graph: each convolution gathers what the one before pooled; and the logits."""
-        assert not self.training, "the dynamic stream reads a frozen static network"
+        require_frozen(self)
         group, levels, stages = groups[0], [], []
         features, offsets = group.points, monomials(group.relative())
         for conv in self.convs:

@@ -14,14 +14,14 @@ from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from dpcli.prepare.decode.calibration import Calibration
+    from dpcli.prepare.decode.pinhole_camera import Calibration
 
 
 @dataclass(frozen=True)
 class DepthCamera:
     """Holds the options that say which camera filmed."""
 
-    HEADING: ClassVar = "Camera"
+    HEADING: ClassVar[str] = "Camera"
     intrinsics: Annotated[
         Path | None, typer.Option("--intrinsics", help="File of RealSense, Open3D, ROS, COLMAP, or with fx fy cx cy.")
     ] = None
@@ -38,8 +38,8 @@ class DepthCamera:
             raise UsageError("--intrinsics and --fx --fy --cx --cy were both given; use one")
         if not self.intrinsics and all(v is None for v in pixels):
             return None
-        from dpcli.prepare.decode.calibration import Calibration, read_calibration
-        from dpcli.prepare.decode.pinhole_camera import Intrinsics
+        from dpcli.prepare.decode.calibration import read_calibration
+        from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 
         if self.intrinsics:
             return read_calibration(self.intrinsics)

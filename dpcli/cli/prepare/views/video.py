@@ -34,7 +34,7 @@ class PictureOptions:
 class CutOutOptions:
     """Holds the options that tell the object from its background."""
 
-    HEADING: ClassVar = "Cutting the object out"
+    HEADING: ClassVar[str] = "Cutting the object out"
     background: Annotated[
         str,
         typer.Option(
@@ -59,7 +59,7 @@ class CutOutOptions:
 class OrbitOptions:
     """Holds the options of the filming camera and of further views."""
 
-    HEADING: ClassVar = "Cameras and further views"
+    HEADING: ClassVar[str] = "Cameras and further views"
     elevation: Annotated[float, typer.Option("--elevation", help="Elevation of the camera, degrees, up = +.")] = 0.0
     radius: Annotated[float, typer.Option("--radius", help="Distance of the cameras from the object's middle.")] = 2.0
     fovy: Annotated[float, typer.Option("--fovy", help="Vertical field of view of the cameras, degrees.")] = 49.1

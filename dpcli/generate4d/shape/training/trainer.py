@@ -23,12 +23,13 @@ from dpcli.generate4d.shape.training.rounds import Batch, MakeViews, Window, ope
 from dpcli.generate4d.shape.training.settings import ShapeSchedule
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
 from dpcli.runtime.seeds import Generate4DStream, generator
 from dpcli.runtime.signals import StopRequest
 
 _WARM = 200  # steps until the learning rate is at its largest
 _GUESSED = 0.25  # of the pictures are decoded at the network's own angles
+_RUNAWAY = 1000  # times the first loss
 _MEMORY = 0.999  # of the running mean of the weights
 
 
@@ -58,6 +59,7 @@ class ShapeTrainer:
         self.per_round = max(1, schedule.round * schedule.reuse // schedule.batch)
         self.optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr, weight_decay=1e-4)
         self.step, self.best, self.sums, self.spent = 0, float("inf"), {"steps": 0.0}, 0.0
+        self.watch: LossWatch | None = None
 
     def run(self) -> Path:
         """Trains from wherever the folder's state says to the last step; returns the file of the best weights.
@@ -112,8 +114,10 @@ class ShapeTrainer:
             loss, parts = shape_loss(self.model, batch, guessed)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)):
+        finite = bool(torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)))
+        if finite:
             self.optimizer.step()
+        self._look_at(float(loss.detach()), finite)
         keep = min(_MEMORY, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for mean, now in zip(self.mean.state_dict().values(), self.model.state_dict().values()):
@@ -121,6 +125,14 @@ class ShapeTrainer:
         for key, value in {"steps": 1.0, "loss": loss.detach(), **parts}.items():
             self.sums[key] = self.sums.get(key, 0.0) + float(value)
         self.step += 1
+
+    def _look_at(self, loss: float, stepped: bool) -> None:
+        """Raises DpcError once the loss has run away from where it began."""
+        self.watch = self.watch or LossWatch(_RUNAWAY * max(loss, 1.0), f", from {loss:.3g}")
+        if problem := self.watch.see(loss, stepped):
+            raise diverged(
+                problem, f"step {self.step + 1}, learning rate {self._learning_rate():.3g}", " with a smaller lr"
+            )
 
     def _end_interval(self, seconds: float) -> None:
         """Validates, writes a row of the log, and saves."""

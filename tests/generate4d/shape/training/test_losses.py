@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from dpcli.errors import DpcError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.learned import choose_angles
 from dpcli.generate4d.shape.network import ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.training.confidence import calibrate, probability
 from dpcli.generate4d.shape.training.losses import depth_error, object_angles
+from dpcli.generate4d.shape.training.trainer import ShapeTrainer
 
 NONE = math.nan
 
@@ -79,3 +82,11 @@ def test_confidence_is_the_share_that_was_better():
     assert probability(0.0, slope, offset) == pytest.approx(1 / (1 + math.exp(0.4)), abs=0.04)
     slope, offset = calibrate(claimed, np.ones(4000))  # always better: high, and finite
     assert 0.9 < probability(0.0, slope, offset) <= 1 and np.isfinite([slope, offset]).all()
+
+
+def test_a_loss_that_runs_away_from_where_it_began_ends_the_training():
+    trainer = SimpleNamespace(watch=None, step=0, _learning_rate=lambda: 1.0)
+    for loss in (3.0, 40.0, float("nan"), 3.0):
+        ShapeTrainer._look_at(trainer, loss, True)
+    with pytest.raises(DpcError, match=r"training diverged \(step 1, learning rate 1\): the loss grew to .*, from 3"):
+        ShapeTrainer._look_at(trainer, 1e6, True)
