@@ -10,13 +10,10 @@ _COSINE = np.cos(np.radians(12))  # of the normals that make one direction
 _NORMALS = 3  # directions of normals of a part
 _FEWEST = 9  # points that make a surface
 _ACROSS = 0.3  # least sine between two normals whose cross product is a direction
-_ALIKE = np.cos(np.radians(4))  # of directions that count as one
-_ANGLES = np.radians(np.arange(90))  # of a rectangle's edges that are tried
-_ENDS = 0.01  # share of the points that may lie outside a rectangle, on each side
 
 
 def surface_directions(points: np.ndarray) -> np.ndarray:
-    """Returns unit vectors f64 (D,3): the edges of the box around the part, its most frequent normals, and those across two.
+    """Returns unit vectors f64 (D,3): the part's most frequent normals and those at right angles to two of them.
 
     points (n,3). Fewer than 9 have none.
     """
@@ -32,31 +29,7 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
         left = left[np.abs(left @ found[-1]) <= _COSINE]
     crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
     found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
-    return distinct_directions(np.concatenate([_box_edges(centered), np.stack(found)]))
-
-
-def distinct_directions(directions: np.ndarray) -> np.ndarray:
-    """Returns the unit vectors (D,3) that lie more than 4 degrees, of either sign, from all before them.
-
-    >>> distinct_directions(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-    """
-    chosen: list[int] = []
-    for k, direction in enumerate(directions):
-        if not chosen or (np.abs(directions[chosen] @ direction) <= _ALIKE).all():
-            chosen.append(k)
-    return directions[chosen]
-
-
-def _box_edges(centered: np.ndarray) -> np.ndarray:
-    """Returns the directions (3,3) of the least rectangle around the points (n,3) in their main plane, and the normal.
-
-    A plate has few normals, and turns about one of its edges.
-    """
-    main = np.linalg.svd(centered, full_matrices=False)[2]
-    turns = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), -np.sin(_ANGLES), np.cos(_ANGLES)], 1).reshape(-1, 2, 2)
-    low, high = np.quantile(turns @ (centered @ main[:2].T).T, [_ENDS, 1 - _ENDS], axis=2)
-    return np.concatenate([turns[(high - low).prod(1).argmin()] @ main[:2], main[2:]])
+    return np.stack(found)
 
 
 def _mean_direction(normals: np.ndarray, first: np.ndarray) -> np.ndarray:
