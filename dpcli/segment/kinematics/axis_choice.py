@@ -17,6 +17,7 @@ from dpcli.store.joints import PRISMATIC, REVOLUTE
 _FRAMES = 12  # of a sequence that are looked at
 _MOST = 256  # points of a part in a frame
 _FEWEST = 9  # points that make a surface
+_ALONG_NOTHING = 3 * NUMBER_PRICE  # what a free axis must save: its two numbers, and it is rare
 _STEPS, _STEPS_ALONG, _WIDE = 10, 6, 1.5  # of a fit, of one along a direction, and the first residual in spacings
 
 
@@ -40,14 +41,14 @@ class SeenParts:
         """Returns a hinge or slide between two parts (rows of `Trajectories`) with the axis that all points say.
 
         The joint is fitted to the points of both parts, whose motions are not exact either, with a free axis and along each
-        of the directions f64 (D,3). A free axis is taken where it saves more than its two numbers cost. Others stay as they are.
+        of the directions f64 (D,3). A free axis is taken where it saves enough. Joints of other types stay as they are.
         """
         if self._frames is None or fit.kind not in (REVOLUTE, PRISMATIC):
             return fit
         masks = [self._part == self._ids[k] for k in (parent, child)]
         best = PointFit(self._frames, masks[1], self._trajectory(parent), self._scaled(fit), parent=masks[0])
         best.run(_STEPS, _WIDE)
-        first, least = best, self._cost(best, masks) + 2 * NUMBER_PRICE
+        first, least = best, self._cost(best, masks) + _ALONG_NOTHING
         for direction in directions:
             axis = direction if direction @ first.joint.axis >= 0 else -direction
             start = replace(first.joint, axis=axis)

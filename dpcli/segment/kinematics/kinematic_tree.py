@@ -81,7 +81,8 @@ def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
     root = int(sizes.argmax())
     seen, joints = SeenParts(sequence, trajectories), []
     for parent, child in _spanning_tree(cost, root):
-        both = np.concatenate([directions[parent], directions[child]])
+        larger = sorted((parent, child), key=lambda k: -sizes[k])  # whose directions are known better
+        both = np.concatenate([directions[k] for k in larger])
         fit = seen.with_axis(parent, child, _oriented(fits, parent, child), distinct_directions(both))
         joints.append(PartJoint(child, parent, fit))
     return KinematicTree(trajectories, points, root, joints)

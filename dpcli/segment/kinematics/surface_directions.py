@@ -10,13 +10,13 @@ _COSINE = np.cos(np.radians(12))  # of the normals that make one direction
 _NORMALS = 3  # directions of normals of a part
 _FEWEST = 9  # points that make a surface
 _ACROSS = 0.3  # least sine between two normals whose cross product is a direction
-_ALIKE = np.cos(np.radians(4))  # of directions that count as one
+_ALIKE = np.cos(np.radians(10))  # of directions that count as one
 _ANGLES = np.radians(np.arange(90))  # of a rectangle's edges that are tried
 _ENDS = 0.01  # share of the points that may lie outside a rectangle, on each side
 
 
 def surface_directions(points: np.ndarray) -> np.ndarray:
-    """Returns unit vectors f64 (D,3): the edges of the box around the part, its most frequent normals, and those across two.
+    """Returns unit vectors f64 (D,3): the part's most frequent normals, those at right angles to two, and its edges.
 
     points (n,3). Fewer than 9 have none.
     """
@@ -27,16 +27,16 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
     found: list[np.ndarray] = []
     left = normals
     while len(found) < _NORMALS and len(left) >= _FEWEST:
-        votes = (np.abs(left @ normals.T) > _COSINE).sum(1)
-        found.append(_mean_direction(normals, left[votes.argmax()]))
+        votes = (np.abs(left @ left.T) > _COSINE).sum(1)
+        found.append(_mean_direction(left, left[votes.argmax()]))
         left = left[np.abs(left @ found[-1]) <= _COSINE]
     crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
     found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
-    return distinct_directions(np.concatenate([_box_edges(centered), np.stack(found)]))
+    return distinct_directions(np.concatenate([np.stack(found), _plate_edges(centered, found[0])]))
 
 
 def distinct_directions(directions: np.ndarray) -> np.ndarray:
-    """Returns the unit vectors (D,3) that lie more than 4 degrees, of either sign, from all before them.
+    """Returns the unit vectors (D,3) that lie more than 10 degrees, of either sign, from all before them.
 
     >>> distinct_directions(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
@@ -48,15 +48,15 @@ def distinct_directions(directions: np.ndarray) -> np.ndarray:
     return directions[chosen]
 
 
-def _box_edges(centered: np.ndarray) -> np.ndarray:
-    """Returns the directions (3,3) of the least rectangle around the points (n,3) in their main plane, and the normal.
+def _plate_edges(centered: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Returns the directions (2,3) of the least rectangle around points (n,3), seen along a normal.
 
-    A plate has few normals, and turns about one of its edges.
+    A plate has one normal, and turns about one of its edges.
     """
-    main = np.linalg.svd(centered, full_matrices=False)[2]
+    plane = np.linalg.svd(normal[None])[2][1:]
     turns = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), -np.sin(_ANGLES), np.cos(_ANGLES)], 1).reshape(-1, 2, 2)
-    low, high = np.quantile(turns @ (centered @ main[:2].T).T, [_ENDS, 1 - _ENDS], axis=2)
-    return np.concatenate([turns[(high - low).prod(1).argmin()] @ main[:2], main[2:]])
+    low, high = np.quantile(turns @ (plane @ centered.T), [_ENDS, 1 - _ENDS], axis=2)
+    return turns[(high - low).prod(1).argmin()] @ plane
 
 
 def _mean_direction(normals: np.ndarray, first: np.ndarray) -> np.ndarray:
