@@ -10,7 +10,9 @@ from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.store import CloudSequence, CloudsReader
+from dpcli.store.parts import PartsReader, PartsSample
 
+_SURE = 0.5  # probability below which a predicted part counts as unknown
 MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the better one first
 
 
@@ -60,7 +62,8 @@ def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarr
 class PairSource:
     """Gives all pairs of adjacent frames with points of some sequences.
 
-    A frame's points are drawn once, since its flow belongs to them. Raises DataError where there is no pair.
+    A frame's points are drawn once, since its flow belongs to them. With a PartsReader, parts and flow are those that the
+    file predicts. Raises DataError where there is no pair.
     """
 
     def __init__(self, reader: CloudsReader, sequences: list[int], points: int, seed: int) -> None:
@@ -90,14 +93,25 @@ class PairSource:
             choose_points(len(c), self.points, generator(self.seed, SegmentStream.FRAME_POINTS, pair.sequence, f))
             for c, f in zip(clouds, frames)
         ]
-        parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
         points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
-        flow = self._flow(pair, sample, points, parts, picks)
+        parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
+        if isinstance(self.reader, PartsReader):
+            said = self.reader.read_parts(pair.sequence)
+            flow = _predicted_flow(said, pair, points, parts, f"{self.reader.path}: {sample.name!r}")
+            parts = np.where(self._sure(said, pair, picks), parts, -1)
+        else:
+            flow = self._flow(pair, sample, points, parts, picks)
         scale = sequence_scale(clouds)
         center = np.float32(points.mean((0, 1)))
         return LoadedPair(
             np.float32((points - center) * scale), parts, None if flow is None else np.float32(flow * scale)
         )
+
+    def _sure(self, said: PartsSample, pair: Pair, picks: list[np.ndarray]) -> np.ndarray:
+        """Returns whether the likeliest part of each chosen point (2,N) is as likely as `_SURE`."""
+        first = int(self.reader.frame_counts[: pair.sequence].sum())
+        ends = np.cumsum([0, *self.reader.frame_sizes[first : first + pair.first + 2]])[pair.first :]
+        return np.stack([said.probability[end + pick].max(1) >= _SURE for end, pick in zip(ends, picks)])
 
     def _flow(
         self, pair: Pair, sample: CloudSequence, points: np.ndarray, parts: np.ndarray, picks: list[np.ndarray]
@@ -113,6 +127,16 @@ class PairSource:
         if pair.first + 2 < self.reader.frame_counts[pair.sequence]:  # scene_flow leads on, to a third frame
             back = backward_flow(sample.frame(0), forth, sample.frame(1))
         return np.stack([forth[picks[0]], back[picks[1]]])
+
+
+def _predicted_flow(said: PartsSample, pair: Pair, points: np.ndarray, parts: np.ndarray, where: str) -> np.ndarray:
+    """Returns the flow (2,N,3) that the predicted motions give points of parts (2,N), each way."""
+    known = np.flatnonzero((said.pairs == [pair.first, pair.first + 1]).all(1))
+    if not len(known):
+        raise DataError(f"{where} has no motion from frame {pair.first} to {pair.first + 1}; predict it again")
+    motion = said.motion[known[0]].astype(np.float64)
+    still = np.broadcast_to(np.eye(4), motion.shape)
+    return np.stack([true_flow(points[0], parts[0], still, motion), true_flow(points[1], parts[1], motion, still)])
 
 
 def backward_flow(points: np.ndarray, flow: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
-from dpcli.segment.multibody.tracks import thin_tracks
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
 from dpcli.segment.prediction_settings import Refinement
@@ -40,8 +39,7 @@ class _Frames:
     thin: list[Tensor]
     scale: float
     center: np.ndarray
-    tracks: list[np.ndarray] | None = None  # of the whole frames
-    thin_tracks: list[np.ndarray] | None = None
+    tracks: list[np.ndarray] | None = None  # of frames that are whole, not thinned
 
 
 def predict_parts(
@@ -60,8 +58,9 @@ def predict_parts(
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
     pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
     masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options)
-    full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
-    full = full if frames.tracks is None else _agree_on_tracks(full, frames.tracks)
+    full = masks
+    if frames.tracks is None:
+        full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
     motion, flow = _in_input_units(frames, masks, full, motions, pairs)
     if len(pairs) < len(reported):
@@ -95,7 +94,7 @@ def _prepare_frames(
 ) -> _Frames:
     """Returns the frames that have points, centered, scaled, and thinned by draws of the sequence's own generator.
 
-    With tracks, all frames keep the same ones; a sequence with a frame of fewer than `_FEWEST` points goes without.
+    With tracks, all points stay.
     """
     filled = [cloud for cloud in clouds if len(cloud)]
     numbers = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
@@ -103,22 +102,9 @@ def _prepare_frames(
     scale = np.float32(sequence_scale(filled)) if options.normalize else np.float32(1)
     whole = [torch.from_numpy((clouds[t] - center) * scale) for t in numbers]
     if tracks is not None:
-        own = [tracks[t] for t in numbers]
-        kept = thin_tracks([cloud.numpy() for cloud in whole], own, options.points)
-        if min(map(len, kept)) >= _FEWEST:
-            thin = [cloud[few] for cloud, few in zip(whole, kept)]
-            return _Frames(numbers, whole, thin, float(scale), center, own, [o[few] for o, few in zip(own, kept)])
+        return _Frames(numbers, whole, whole, float(scale), center, [tracks[t] for t in numbers])
     thin = [_thin(cloud, options.points, generator(seed, index, t)) for t, cloud in zip(numbers, whole)]
     return _Frames(numbers, whole, thin, float(scale), center)
-
-
-def _agree_on_tracks(masks: list[Tensor], tracks: list[np.ndarray]) -> list[Tensor]:
-    """Returns the masks (N_t,S) with the mean over all frames at the points of each track (N_t)."""
-    _, index, count = np.unique(np.concatenate(tracks), return_inverse=True, return_counts=True)
-    place = torch.from_numpy(index.reshape(-1))
-    total = torch.zeros(len(count), masks[0].shape[1]).index_add_(0, place, torch.cat(masks))
-    mean = total / torch.from_numpy(np.float32(count))[:, None]
-    return list(mean[place].split([len(mask) for mask in masks]))
 
 
 def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
@@ -140,7 +126,7 @@ def _find_masks_and_motions(
     """
     if isinstance(segmenter, MultibodySegmenter):
         with torch_threads(1):
-            masks, motions = segmenter.explain(frames.thin, pairs, frames.thin_tracks)
+            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks)
         return masks, [motions[pair] for pair in pairs]
     flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
     masks = _refine_masks(frames.thin, flows, masks, options)

@@ -7,8 +7,8 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.segment.frame_pairs import PairSource, backward_flow
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from tests.support.drawers import drawer
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader
+from tests.support.drawers import drawer, predicted
 
 
 def test_training_leaves_pairs_without_points_out(tmp_path, capsys):
@@ -69,3 +69,20 @@ def test_a_pose_without_an_inverse_is_bad_data(tmp_path):
     with CloudsReader(tmp_path / "d.h5") as reader, pytest.raises(DataError, match="d: a pose is no rigid motion"):
         source = PairSource(reader, [0], 20, 0)
         source.load(source.pairs[0])
+
+
+def test_a_prediction_gives_pairs_its_parts_and_motions(tmp_path):
+    """The true parts and motions, told by a parts file, give what poses give; unsure points have no part."""
+    path = predicted(tmp_path / "parts.h5", [drawer("d", 0)], unsure=7)
+    with CloudsWriter(tmp_path / "d.h5", fields=["part", "pose"]) as writer:
+        writer.write(drawer("d", 0))
+    ours, theirs = PairSource(PartsReader(path), [0], 48, 3), PairSource(CloudsReader(tmp_path / "d.h5"), [0], 48, 3)
+    for pair in ours.pairs:
+        one, other = ours.load(pair), theirs.load(pair)
+        np.testing.assert_array_equal(one.points, other.points)
+        np.testing.assert_allclose(one.flow, other.flow, atol=1e-5)
+        assert 0 < (one.part == -1).sum() < 14  # of the seven in each frame, those that were drawn
+        np.testing.assert_array_equal(one.part[one.part >= 0], other.part[one.part >= 0])
+    short = PairSource(PartsReader(predicted(tmp_path / "one.h5", [drawer("d", 0)], pairs=1)), [0], 48, 3)
+    with pytest.raises(DataError, match="'d' has no motion from frame 1 to 2; predict it again"):
+        short.load(short.pairs[1])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.segment.frame_pairs import frame_parts, true_flow
-from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store import CloudSequence, CloudsWriter, PartsWriter
 
 TRAIN = ("--flow", "nearest", "--points", 48, "--batch", 2, "--epochs", 2, "--set", "pairs_per_epoch=6", "--seed", 3)
 
@@ -46,3 +46,19 @@ def with_scene_flow(sequence: CloudSequence) -> CloudSequence:
         rows.append(true_flow(sequence.frame(t), frame_parts(sequence, t), *poses))
     sequence.scene_flow = np.float32(np.concatenate(rows))
     return sequence
+
+
+def predicted(path: Path, sequences: list[CloudSequence], unsure: int = 0, pairs: int | None = None) -> Path:
+    """A parts file that says the truth; the last `unsure` points of each frame are in neither part for sure."""
+    with PartsWriter(path, num_parts=3, provenance={"command": "dpc segment predict"}) as writer:
+        for sequence in sequences:
+            probability = np.eye(3, dtype=np.float32)[sequence.part]
+            for end in sequence.frame_offsets[1:] if unsure else []:
+                probability[end - unsure : end] = [0.2, 0.45, 0.35]
+            said = np.array([(t, t + 1) for t in range(sequence.num_frames - 1)][:pairs])
+            motion = np.tile(np.eye(4), (len(said), 3, 1, 1))
+            motion[:, :2] = sequence.pose[said[:, 1]] @ np.linalg.inv(sequence.pose[said[:, 0]])
+            flow = [np.zeros_like(sequence.frame(t)) for t, _ in said]
+            sequence.pose = None
+            writer.write(sequence, probability, said, motion, flow)
+    return path

@@ -9,9 +9,10 @@ from torch import Tensor
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.depth import calm_depth
 from dpcli.generate4d.scene.model import Model4D
-from dpcli.generate4d.scene.rigid_parts import find_parts, trust
+from dpcli.generate4d.scene.seen_gaussians import trust
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
+from dpcli.ops.rigid_parts import find_parts
 from dpcli.ops.rotations import normalize_quaternion
 from dpcli.store.gaussians import GaussianScene
 

@@ -30,6 +30,7 @@ from dpcli.segment.training.learning_curves import COLUMNS, draw_curves
 from dpcli.segment.training.settings import CATALOG, RunSettings, TrainSettings
 from dpcli.segment.training.trainer import Trainer
 from dpcli.store import CloudsReader, input_file
+from dpcli.store.parts import PartsReader
 from dpcli.text_files import read_json
 
 
@@ -41,10 +42,8 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
     chosen, supervised = choose_device(device), settings.objective.supervised
     config = settings.network.config()
     with input_file(data) as path:
-        reader = CloudsReader(path)
+        reader = _open_labels(path) if supervised else CloudsReader(path)
         learned, held = hold_out_sequences(reader, settings.run.validation, seed)
-        if supervised:
-            _check_labels(reader)
         mixed = wanted(settings.precision.amp, chosen)
         used = _find_weights(settings)
         record = _describe_run(path, config, settings, seed, mixed, used)
@@ -60,7 +59,8 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
             "command": provenance.command_line(),
             "data": record["data"],
             "seed": seed,
-            "supervised": supervised,
+            "supervised": supervised and not isinstance(reader, PartsReader),
+            **({"labels": "predicted"} if isinstance(reader, PartsReader) else {}),
             "flow": settings.run.flow,
             "trained_on": f"{len(learned)} sequences, {len(training.pairs)} pairs",
         }
@@ -144,8 +144,14 @@ def _start_network(config: PartConfig, init: Path | None, folder: RunFolder) -> 
     return model
 
 
-def _check_labels(reader: CloudsReader) -> None:
-    """Raises DataError where the file lacks what --supervised learns from."""
+def _open_labels(path: Path) -> CloudsReader:
+    """Returns the reader of a file to learn from its labels: a PartsReader where the file is a prediction.
+
+    Raises DataError where the file lacks what --supervised learns from.
+    """
+    reader = CloudsReader(path)
+    if reader.attributes["dpc_kind"] == "parts":
+        return PartsReader(path)
     missing = [] if "part" in reader.fields else ["part"]
     if not any(name in reader.fields for name in MOTION_FIELDS):
         missing.append(" or ".join(MOTION_FIELDS))
@@ -154,3 +160,4 @@ def _check_labels(reader: CloudsReader) -> None:
             f"{reader.path}: --supervised needs part ids and poses or scene flow, but the file has no "
             f"{' and no '.join(missing)}"
         )
+    return reader

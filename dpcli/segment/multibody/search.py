@@ -10,26 +10,17 @@ from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.settings import MultibodySettings
-from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
 
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
-def explain_sequence(
-    clouds: list[np.ndarray], settings: MultibodySettings, tracks: list[np.ndarray] | None = None
-) -> Explanation:
-    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
-
-    tracks: the identity i64 (n_t) of each point, which makes correspondences exact; none: they are searched.
-    """
-    if tracks is None:
-        search = Search(Frames(clouds), settings)
-        found = turn_least(search.frames, search.run())
-        return search.judged_anew(simplify_motions(search.frames, found))
-    frames = TrackedFrames(clouds, tracks, settings.flexible)
-    return Search(frames, settings, patch_hypotheses(frames)).run()
+def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings) -> Explanation:
+    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1."""
+    search = Search(Frames(clouds), settings)
+    found = turn_least(search.frames, search.run())
+    return search.judged_anew(simplify_motions(search.frames, found))
 
 
 class Search:

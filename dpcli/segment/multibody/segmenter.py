@@ -13,6 +13,7 @@ from dpcli.segment.multibody.explanation import Explanation
 from dpcli.segment.multibody.frames import relative_motion
 from dpcli.segment.multibody.search import explain_sequence
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.multibody.tracks import Tracks, follow_tracks, parts_of_tracks
 from dpcli.segment.segmenters import Flows, Segmenter
 
 _TEMPERATURE = 0.2  # of masks, in costs of a point
@@ -50,17 +51,35 @@ class MultibodySegmenter(Segmenter):
         """
         if len(frames) == 1:
             return [torch.eye(self.slots)[:1].repeat(len(frames[0]), 1)], {}
-        found = explain_sequence([frame.numpy() for frame in frames], self.settings, tracks)
+        if tracks is not None:
+            return self._by_tracks(follow_tracks([frame.numpy() for frame in frames], tracks), pairs)
+        found = explain_sequence([frame.numpy() for frame in frames], self.settings)
         sizes = [len(frame) for frame in frames]
         masks = list(torch.from_numpy(masks_of(found, sizes, self.slots)).split(sizes))
         return masks, {pair: self._motions(found, *pair) for pair in pairs}
 
+    def _by_tracks(self, tracks: Tracks, pairs: list[tuple[int, int]]) -> tuple[list[Tensor], Motions]:
+        """Returns masks, of which each point has one alone, and motions of parts whose points are followed."""
+        part, motions = parts_of_tracks(tracks, self.settings), {}
+        for t, u in pairs:
+            motion = np.tile(np.eye(3, 4), (self.slots, 1, 1))
+            for k in range(part.max() + 1):
+                motion[k] = tracks.motion(part == k, t, u)
+            motions[t, u] = _as_tensors(motion)
+        return [torch.eye(self.slots)[part[own]] for own in tracks.index], motions
+
     def _motions(self, found: Explanation, t: int, u: int) -> tuple[Tensor, Tensor]:
         """Returns the motions (S,3,3), (S,3) of all slots from frame t to frame u."""
-        motion = np.tile(np.eye(3, 4, dtype=np.float32), (self.slots, 1, 1))
+        motion = np.tile(np.eye(3, 4), (self.slots, 1, 1))
         for k, body in enumerate(found.bodies):
             motion[k] = relative_motion(body.trajectory, t, u)
-        return torch.from_numpy(motion[:, :, :3].copy()), torch.from_numpy(motion[:, :, 3].copy())
+        return _as_tensors(motion)
+
+
+def _as_tensors(motion: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Returns rotations (S,3,3) and shifts (S,3) of motions (S,3,4), f32."""
+    both = torch.from_numpy(np.float32(motion))
+    return both[:, :, :3].contiguous(), both[:, :, 3].contiguous()
 
 
 def masks_of(found: Explanation, sizes: list[int], slots: int) -> np.ndarray:

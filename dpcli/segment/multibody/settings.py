@@ -30,7 +30,7 @@ class MultibodySettings:
         0.05, "multibody: cost of a point per diameter that it lies from where the largest body would take it.", least=0
     )
     flexible: float = setting(
-        0.02, "multibody: deviation from rigid motion that counts one half where tracks are given, diameters.", above=0
+        0.02, "multibody: how far points bend away from rigid motion where tracks are given, diameters.", above=0
     )
     regrow: int = setting(
         2, "multibody: rounds in which each body in turn is taken out and its points are explained anew.", least=0

@@ -179,6 +179,7 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
     terms = {"mask": supervised_loss(frames.mask, batch.part)}
     if model.motion is not None:
         truth = torch.nn.functional.one_hot(batch.part.clamp(0, model.config.slots - 1), model.config.slots).float()
+        truth = truth * (batch.part >= 0)[..., None]  # what is unknown moves with no part
         rotation, _ = weighted_kabsch(batch.points, batch.points + batch.flow, truth)
         terms["motion"] = objective.motion * _motion(model, batch, frames, truth, rotation)
     loss = torch.stack(list(terms.values())).sum()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpcli.generate4d.scene.rigid_parts import find_parts, trust
+from dpcli.generate4d.scene.seen_gaussians import trust
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
+from dpcli.ops.rigid_parts import find_parts
 
 FRAMES, POINTS = 12, 300
 

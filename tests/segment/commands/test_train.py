@@ -19,7 +19,7 @@ from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.store import CloudsWriter
 from dpcli.text_files import read_toml
-from tests.support.drawers import TRAIN, drawer
+from tests.support.drawers import TRAIN, drawer, predicted
 
 
 def test_training_leaves_what_people_look_for(run_folder):
@@ -100,6 +100,20 @@ def test_supervised_training_learns_from_scene_flow(flow_data, tmp_path):
     refused = train(tmp_path / "bare.h5", "no").exception
     assert isinstance(refused, DataError)
     assert "poses or scene flow, but the file has no pose or scene_flow" in str(refused)
+
+
+def test_supervised_training_learns_from_a_prediction(tmp_path):
+    """A parts file needs no poses; its weights say that no annotation was read."""
+    from dpcli.segment.network.model_file import load_model
+
+    data = predicted(tmp_path / "parts.h5", [drawer(name, 0, split="train") for name in "ab"], unsure=5)
+    words = ["--supervised", "--points", 48, "--batch", 2, "--epochs", 1, "--set", "pairs_per_epoch=2"]
+    done = CliRunner().invoke(app, ["segment", "train", str(data), "-o", str(tmp_path / "run"), *map(str, words)])
+    assert done.exit_code == 0, done.exception
+    (row,) = json.loads((tmp_path / "run" / "log.json").read_text())
+    assert np.isfinite(row["loss"]) and row["motion"] > 0
+    _, notes = load_model(tmp_path / "run" / "best.safetensors")
+    assert notes["supervised"] is False and notes["labels"] == "predicted"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.search import Search, explain_sequence
 from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
-from dpcli.segment.multibody.tracks import thin_tracks
+from dpcli.segment.multibody.tracks import fit_motions, follow_tracks
 from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import Refinement
 from dpcli.segment.training.trainer import rand_index
@@ -123,20 +123,54 @@ def test_one_motion_stays_one_part():
 
 def test_tracks_are_exact_and_may_begin_and_end():
     sequence = chest(keep=True, frames=5)
-    labels, _ = predicted(sequence, points=200)
-    assert agreement(labels, sequence) > 0.95
+    labels, sample = predicted(sequence, pairs="all")
+    assert agreement(labels, sequence) > 0.99
     by_track = [set(labels[sequence.track == track]) for track in np.unique(sequence.track)]
     assert all(len(own) == 1 for own in by_track)
+    lid = int(np.bincount(labels[sequence.part == 1]).argmax())
+    for pair, motion in zip(sample.pairs, sample.motion):
+        true = sequence.pose[pair[1], 1] @ np.linalg.inv(sequence.pose[pair[0], 1])
+        assert np.abs(motion[lid] - true).max() < 1e-3
 
 
-def test_thinned_tracks_are_the_same_in_all_frames():
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_small_moving_parts_of_tracks_are_found_and_nothing_else(noise):
+    """A box with a knob of 12 of 500 points that turns in place, seen in six frames, each of which lacks every fifth track."""
+    rng = np.random.default_rng(3)
+    body, knob = (
+        box_surface(rng, 488, (0, 0, 0), (0.6, 0.4, 0.3)),
+        box_surface(rng, 12, (0.6, 0.15, 0.1), (0.08, 0.1, 0.1)),
+    )
+    clouds, tracks, truth = [], [], np.repeat([0, 1], [488, 12])
+    for t in range(6):
+        whole = turn(0.1 * t, (0.0, 0.6, 0.8), (0.2, 0.1, 0.0))
+        own = whole @ turn(0.4 * t, (1.0, 0.0, 0.0), (0.6, 0.2, 0.15))
+        cloud = np.concatenate([p @ m[:3, :3].T + m[:3, 3] for p, m in ((body, whole), (knob, own))])
+        tracks.append(rng.permutation(500)[:400])
+        clouds.append(np.float32(cloud + noise * rng.standard_normal(cloud.shape))[tracks[-1]])
+    sequence = CloudSequence.from_frames("box", clouds, track=tracks)
+    labels, _ = predicted(sequence)
+    right = labels == (truth[sequence.track] > 0)
+    assert set(np.unique(labels)) == {0, 1} and right.mean() > 0.995
+    still = CloudSequence.from_frames("box", [clouds[0], clouds[0]], track=[tracks[0], tracks[0]])
+    assert not predicted(still)[0].any()
+
+
+def test_tracks_go_on_where_no_frame_shows_them():
     rng = np.random.default_rng(2)
-    cloud = np.float32(rng.random((100, 3)))
-    tracks = [rng.permutation(100), rng.permutation(100)[:80], 50 + rng.permutation(100)]
-    clouds = [cloud[track % 100] for track in tracks]
-    kept = [set(track[few]) for track, few in zip(tracks, thin_tracks(clouds, tracks, 40))]
-    assert len(kept[0]) == 40 and kept[1] == kept[0] & set(tracks[1])
-    assert kept[0] & set(tracks[2]) <= kept[2] and len(kept[2]) <= 40 and any(track >= 100 for track in kept[2])
+    cloud, motions = rng.random((60, 3)), [turn(0.3 * t, (0, 0, 1), (0.5, 0.5, 0.5)) for t in range(4)]
+    tracks = [np.arange(40), 10 + rng.permutation(50), np.arange(50), np.arange(20, 60)]
+    clouds = [cloud[own] @ m[:3, :3].T + m[:3, 3] for own, m in zip(tracks, motions)]
+    found = follow_tracks(clouds, tracks)
+    for t, motion in enumerate(motions):
+        np.testing.assert_allclose(found.places[t], cloud @ motion[:3, :3].T + motion[:3, 3], atol=1e-9)
+        assert found.shown[t].sum() == len(tracks[t]) and (found.index[t] == tracks[t]).all()
+    every = np.ones(60, bool)
+    np.testing.assert_allclose(found.motion(every, 0, 3), (motions[3] @ np.linalg.inv(motions[0]))[:3], atol=1e-9)
+    apart = follow_tracks([cloud[:9], cloud[9:]], [np.arange(9), np.arange(9, 60)])  # no track in common
+    assert np.isfinite(apart.places).all() and apart.shown.sum() == 60
+    few = fit_motions(cloud[None, :2], cloud[None, :2] + [0.0, 0.0, 2.0])
+    np.testing.assert_allclose(few[0], np.eye(3, 4) + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 from dpcli.segment.frame_pairs import PairSource
+from dpcli.segment.network.config import compact
+from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.training.pair_loss import Batch, pair_loss, turn_randomly
 from dpcli.segment.training.settings import Objective
 from dpcli.store import CloudsReader
@@ -48,3 +50,17 @@ def test_turning_keeps_pairs_together():
     turned, rotation = turn_randomly(points, torch.Generator().manual_seed(0))
     assert torch.equal(rotation[:3], rotation[3:]) and not torch.allclose(rotation[0], rotation[1])
     assert torch.allclose(torch.cdist(points, points), torch.cdist(turned, turned), atol=1e-4)
+
+
+def test_the_flow_of_points_of_unknown_parts_teaches_nothing(data):
+    """With labels, a point of part -1 counts neither for masks nor for the motion of part 0."""
+    source = PairSource(CloudsReader(data), [0], 48, 0)
+    loaded = [source.load(source.pairs[0])]
+    stacked = (torch.tensor(np.stack([getattr(p, key) for p in loaded])) for key in ("points", "flow", "part"))
+    batch = Batch(*(values.transpose(0, 1).flatten(0, 1) for values in stacked))
+    batch.part[:, :10] = -1
+    torch.manual_seed(0)
+    network = PartNetwork(compact()).eval()
+    first = pair_loss(network, batch, Objective(supervised=True), 0.0).terms
+    batch.flow[:, :10] += torch.linspace(-3, 3, 30).view(10, 3)
+    assert pair_loss(network, batch, Objective(supervised=True), 0.0).terms == first

@@ -1,8 +1,4 @@
-"""Rigid parts found on the whole motion of a fitted scene: patches are joined as long as their union moves rigidly.
-
-The partition network of the fit sees two frames a step and has one number of parts. Here all frames speak at once, and
-only Gaussians that a camera sees: what hides behind them moves as the network happens to continue.
-"""
+"""Rigid parts of points that are followed through all frames: patches are joined as long as their union moves rigidly."""
 
 from __future__ import annotations
 
@@ -12,25 +8,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_PATCHES = 150  # small enough to lie within one part each
+_OF_PATCH = 3  # points that a patch has at least, in the mean
 _FRAMES = 32  # of a long clip, evenly spaced
-_NEIGHBORS = 8  # Gaussians whose patches touch
+_NEIGHBORS = 8  # points whose patches touch
 _TRAVEL = 3.0  # weight of motion beside position where patches and neighbors are chosen
 _COMPACT = 0.002  # weight of a part's extent beside its residuals; chosen with _PRICE on clips of known parts
-_SAME = 1e-6  # what the residuals of two parts may grow by where their extent doesn't count
-_MOVES = 1e-4  # squared diameters per Gaussian that one rigid motion leaves where a clip moves enough for _COMPACT
-_PRICE = 5e-6  # squared diameters per Gaussian that joining two parts may cost
-_SEEN, _ENOUGH = 0.3, 0.15  # share of the frames that shows a Gaussian; share of such Gaussians that speaks for all
-_CELLS, _BEHIND = 96, 0.02  # of the depth buffer along a side; depth in diameters within which a surface is seen
+_SAME = 0.2  # share of the price that the residuals of two parts may grow by where their extent doesn't count
+_MOVES = 1e-4  # squared diameters per point that one rigid motion leaves where a clip moves enough for _COMPACT
+_PRICE = 5e-6  # squared diameters per point that joining two parts may cost, where they bend
+_LEAST, _OF_BEND = 2e-7, 30.0  # the price where nothing bends; the price in squared bends of patches, between the two
 
 
 @dataclass
 class _Sums:
-    """Holds sums over the Gaussians of B patches, from which the residuals of any union follow; each can be added."""
+    """Holds weighted sums over the points of B patches, from which the residuals of any union follow; each can be added."""
 
-    count: np.ndarray  # [B]
-    start: np.ndarray  # [B, 3]
-    start_squared: np.ndarray  # [B]
+    count: np.ndarray  # [B, T]
+    start: np.ndarray  # [B, T, 3]
+    start_squared: np.ndarray  # [B, T]
     moved: np.ndarray  # [B, T, 3]
     moved_squared: np.ndarray  # [B, T]
     product: np.ndarray  # [B, T, 3, 3]
@@ -54,51 +49,72 @@ class _Sums:
 
     def cost(self, compact: float) -> np.ndarray:  # [B]
         """Returns what the best rigid motions leave of each patch, a mean over frames, plus `compact` times its extent."""
-        count = self.count[:, None]
         extent = self.start_squared - np.square(self.start).sum(-1) / self.count
-        spread = self.moved_squared - np.square(self.moved).sum(-1) / count
-        covariance = self.product - self.moved[..., None] * self.start[:, None, None] / count[..., None, None]
+        spread = self.moved_squared - np.square(self.moved).sum(-1) / self.count
+        covariance = self.product - self.moved[..., None] * self.start[..., None, :] / self.count[..., None, None]
         values = np.linalg.svd(covariance, compute_uv=False)
         values[..., 2] *= np.where(np.linalg.det(covariance) < 0, -1, 1)  # Kabsch: a mirror image is no motion
-        residual = extent[:, None] + spread - 2 * values.sum(-1)
-        return residual.clip(0).mean(1) + compact * extent
+        residual = extent + spread - 2 * values.sum(-1)
+        return residual.clip(0).mean(1) + compact * extent[:, 0]
 
 
-def find_parts(frames: np.ndarray, trusted: np.ndarray, most: int) -> np.ndarray:
+def find_parts(
+    frames: np.ndarray,
+    trusted: np.ndarray,
+    most: int,
+    *,
+    patches: int = 150,
+    softness: float = 1.0,
+    weights: np.ndarray | None = None,
+) -> np.ndarray:
     """Returns the part i64 (N) of points whose places are f (T,N,3), found on the trusted ones (mask (N), any) alone.
 
     Points in one part move almost rigidly over the whole clip and lie together. Their number follows from what a further
     part explains, up to `most`; the first is the largest. Other points go with the trusted one that stays nearest.
+    patches: how many are joined, at most; smaller parts than one are lost. softness: how far parts may bend, 1 as animals'
+    skin does; of things that hardly bend within patches, smaller motions tell parts apart. weights: f (T,N) above 0, how
+    much a point's place in a frame counts; in the first frame it always does in full.
     """
     from scipy.spatial import cKDTree
 
-    frames = frames[np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)].astype(np.float64)
+    few = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
+    weights = np.ones(frames.shape[:2]) if weights is None else weights
+    frames, weights = frames[few].astype(np.float64), weights[few][:, trusted]
     own = frames[:, trusted]
     diameter = np.linalg.norm(np.ptp(own[0], axis=0))
     if len(own[0]) < 2 * _NEIGHBORS or most < 2 or not diameter > 0:
         return np.zeros(frames.shape[1], np.int64)
     own = (own - own.mean(1, keepdims=True)) / diameter
-    label = _trusted_parts(own, most)
+    label = _join(own, weights, _patches(own, patches), most, softness)
     order = np.argsort(-np.bincount(label), kind="stable")
     label = np.argsort(order)[label]
     few = frames[:: max(len(frames) // 8, 1)].transpose(1, 0, 2).reshape(len(trusted), -1)
     return label[cKDTree(few[trusted]).query(few)[1]]
 
 
-def _trusted_parts(own: np.ndarray, most: int) -> np.ndarray:  # [T, M, 3] diameter 1 -> [M]
+def _join(
+    own: np.ndarray,  # [T, M, 3], of diameter 1
+    weights: np.ndarray,  # [T, M]
+    patch: np.ndarray,  # [M]
+    most: int,
+    softness: float,
+) -> np.ndarray:  # [M]
     """Returns the part of each point: patches joined by motion and extent, then parts that move alike by motion alone."""
-    patch = _patches(own)
-    sums, touching = _sums(own, patch), _touching(own, patch)
-    # where hardly anything moves, extent would be all that counts
-    compact = _COMPACT * min(sums.whole().cost(0.0)[0] / len(patch) / _MOVES, 1.0)
-    part = _Joining(sums, touching, compact).run(_PRICE * len(patch), most)
+    sums, touching = _sums(own, weights, patch), _touching(own, patch)
+    free = 3 * sums.count.mean(1) - 6  # numbers of a patch that its rigid motion leaves
+    bend = np.median((sums.cost(0.0) / free.clip(1))[free > 0]) if (free > 0).any() else 0.0
+    most_price = _PRICE * softness**2
+    price = float(np.clip(_OF_BEND * bend, min(_LEAST, most_price), most_price))
+    # where hardly anything moves or bends, extent would be all that counts
+    compact = _COMPACT * price / _PRICE * min(sums.whole().cost(0.0)[0] / len(patch) / _MOVES, 1.0)
+    part = _Joining(sums, touching, compact).run(price * len(patch), most)
     # a long body that moves as one has been cut by its extent
     pairs = {(min(part[[a, b]].tolist()), max(part[[a, b]].tolist())) for a, b in touching}
-    joining = _Joining(_sums(own, part[patch]), {(a, b) for a, b in pairs if a != b}, 0.0)
-    return joining.run(_SAME * len(patch), most)[part][patch]
+    joining = _Joining(_sums(own, weights, part[patch]), {(a, b) for a, b in pairs if a != b}, 0.0)
+    return joining.run(_SAME * price * len(patch), most)[part][patch]
 
 
-def _patches(own: np.ndarray) -> np.ndarray:  # [T, M, 3] -> [M]
+def _patches(own: np.ndarray, most: int) -> np.ndarray:  # [T, M, 3] -> [M]
     """Returns small patches of points that lie together and go together: k-means from spread places."""
     from scipy.cluster.vq import kmeans2
 
@@ -107,7 +123,7 @@ def _patches(own: np.ndarray) -> np.ndarray:  # [T, M, 3] -> [M]
     few = own[:: max(len(own) // 8, 1)]
     travel = few - few.mean(0)
     feature = np.concatenate([own[0], *(_TRAVEL / len(few) ** 0.5 * travel)], 1)
-    start = feature[fps_numpy(own[0], min(_PATCHES, len(feature) // _NEIGHBORS))]
+    start = feature[fps_numpy(own[0], min(most, len(feature) // _OF_PATCH))]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a patch that lost all its points isn't missed
         label = kmeans2(feature, start, iter=10, minit="matrix")[1]
@@ -124,13 +140,16 @@ def _touching(own: np.ndarray, patch: np.ndarray) -> set[tuple[int, int]]:
     return {(int(a), int(b)) for a, b in np.unique(np.sort(pairs, 1), axis=0) if a != b}
 
 
-def _sums(own: np.ndarray, patch: np.ndarray) -> _Sums:
+def _sums(own: np.ndarray, weights: np.ndarray, patch: np.ndarray) -> _Sums:
     """Returns the sums of each patch over its points; they start where they are in the first frame."""
-    start, rows = own[0], []
+    rows = []
     for index in range(patch.max() + 1):
-        x, y = start[patch == index], own[:, patch == index]
-        product = np.swapaxes(y, 1, 2) @ x
-        rows.append((len(x), x.sum(0), np.square(x).sum(), y.sum(1), np.square(y).sum((1, 2)), product))
+        inside = patch == index
+        x, y, w = own[0, inside], own[:, inside], weights[:, inside]
+        weighted = w[..., None] * y  # [T, M, 3]
+        product = np.swapaxes(weighted, 1, 2) @ x
+        squares = w @ np.square(x).sum(1), (w * np.square(y).sum(2)).sum(1)
+        rows.append((w.sum(1), w @ x, squares[0], weighted.sum(1), squares[1], product))
     return _Sums(*(np.array(column, np.float64) for column in zip(*rows)))
 
 
@@ -184,33 +203,3 @@ class _Joining:
         together = self.sums.pick(first).plus(self.sums.pick(second)).cost(self.compact)
         for a, b, both in zip(first, second, together):
             heapq.heappush(self.offers, (both - self.cost[a] - self.cost[b], a, b, self.version[a], self.version[b]))
-
-
-def trust(
-    frames: np.ndarray, solid: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
-) -> np.ndarray:
-    """Returns which Gaussians may speak for the motion, bool (N): solid ones (mask (N)) that some view often sees.
-
-    frames: f (T,N,3); poses (V,4,4), intrinsics (V,3,3) and the size of pictures are those of the fitted views. Where
-    they see too small a share, as from an animal's front, all solid ones do; where nothing is solid, all do.
-    """
-    solid = solid if solid.any() else np.ones_like(solid)
-    shown = np.zeros(frames.shape[1])
-    for places in frames:
-        shown[solid] += np.any([_front(places[solid], *view, size) for view in zip(poses, intrinsics)], 0)
-    often = solid & (shown > _SEEN * len(frames))
-    return often if often.sum() >= _ENOUGH * solid.sum() else solid
-
-
-def _front(points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Returns which points (N,3) no other hides from a camera, bool (N), by the nearest depth in each cell and around it."""
-    from scipy.ndimage import minimum_filter
-
-    camera = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = camera[:, 2].clip(1e-6)
-    cell = (camera @ intrinsics.T)[:, :2] / depth[:, None] * (_CELLS / max(size))
-    column, row = np.moveaxis(np.clip(cell, 0, _CELLS - 1).astype(int), -1, 0)
-    nearest = np.full((_CELLS, _CELLS), np.inf)
-    np.minimum.at(nearest, (row, column), depth)
-    nearest = minimum_filter(nearest, 3)
-    return depth <= nearest[row, column] + _BEHIND * np.linalg.norm(np.ptp(points, axis=0))
