@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dpcli.segment.kinematics.axis_choice import SeenParts
 from dpcli.segment.kinematics.joint_fit import JointFit, fit_joint
 from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajectories, points_at_start
 from dpcli.segment.kinematics.registration import Registration, register, relative_registration
-from dpcli.segment.kinematics.surface_directions import distinct_directions, surface_directions
+from dpcli.segment.kinematics.surface_directions import surface_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
@@ -79,12 +78,7 @@ def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
         fits[a, b] = _relative_joint(known[a], known[b], trajectories.seen[:, a] & trajectories.seen[:, b], both)
         cost[a, b] = cost[b, a] = fits[a, b].length + _APART * gaps[a, b] - _LARGE * sizes[a] / sizes.max()
     root = int(sizes.argmax())
-    seen, joints = SeenParts(sequence, trajectories), []
-    for parent, child in _spanning_tree(cost, root):
-        larger = sorted((parent, child), key=lambda k: -sizes[k])  # whose directions are known better
-        both = np.concatenate([directions[k] for k in larger])
-        fit = seen.with_axis(parent, child, _oriented(fits, parent, child), distinct_directions(both))
-        joints.append(PartJoint(child, parent, fit))
+    joints = [PartJoint(child, parent, _oriented(fits, parent, child)) for parent, child in _spanning_tree(cost, root)]
     return KinematicTree(trajectories, points, root, joints)
 
 

@@ -16,7 +16,7 @@ _ENDS = 0.01  # share of the points that may lie outside a rectangle, on each si
 
 
 def surface_directions(points: np.ndarray) -> np.ndarray:
-    """Returns unit vectors f64 (D,3): the part's most frequent normals, those at right angles to two, and its edges.
+    """Returns unit vectors f64 (D,3): the part's most frequent normals and those at right angles to two of them.
 
     points (n,3). Fewer than 9 have none.
     """
@@ -27,12 +27,18 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
     found: list[np.ndarray] = []
     left = normals
     while len(found) < _NORMALS and len(left) >= _FEWEST:
-        votes = (np.abs(left @ left.T) > _COSINE).sum(1)
-        found.append(_mean_direction(left, left[votes.argmax()]))
+        votes = (np.abs(left @ normals.T) > _COSINE).sum(1)
+        found.append(_mean_direction(normals, left[votes.argmax()]))
         left = left[np.abs(left @ found[-1]) <= _COSINE]
     crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
     found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
-    return distinct_directions(np.concatenate([np.stack(found), _plate_edges(centered, found[0])]))
+    return np.stack(found)
+
+
+def directions_and_edges(points: np.ndarray) -> np.ndarray:
+    """Returns the part's surface directions, and the edges of a plate across the most frequent, f64 (D,3)."""
+    found = surface_directions(points)
+    return np.concatenate([found, _plate_edges(points - points.mean(0), found[0])]) if len(found) else found
 
 
 def distinct_directions(directions: np.ndarray) -> np.ndarray:

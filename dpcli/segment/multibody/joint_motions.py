@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from dpcli.segment.kinematics.joint_fit import JointFit, nearest_joints
-from dpcli.segment.kinematics.point_fit import NUMBER_PRICE, PointFit
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
 from dpcli.segment.multibody.frames import Frames, Trajectory, compose
+from dpcli.segment.multibody.point_fit import NUMBER_PRICE, PointFit
 from dpcli.store.joints import REVOLUTE
 
 _PARENTS = 2  # larger bodies tried, those that it touches most

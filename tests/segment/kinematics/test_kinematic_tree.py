@@ -10,6 +10,7 @@ from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories
 from dpcli.segment.kinematics.registration import Registration
+from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
 
@@ -83,17 +84,18 @@ def test_hinges_slides_and_the_tree_of_a_cabinet():
     edges = {frozenset((k, int(row[PARENT]))): k for k, row in enumerate(field[0]) if row[PARENT] >= 0}
     assert set(edges) == {frozenset((0, 1)), frozenset((1, 2)), frozenset((0, 3))}
     assert (field[:, 4:, PARENT] == -1).all()  # ids that the sequence lacks
-    for edge, kind, axis, point, value, off in (
-        ((0, 1), REVOLUTE, (0, 0, 1), (0.3, 0.3, 0), angles, 0.02),
-        ((1, 2), REVOLUTE, (0, 1, 0), (-0.2, 0.35, 0), turn, 0.1),  # a knob, whose 120 points say no more
-        ((0, 3), PRISMATIC, (0, 1, 0), None, slide, 0.02),
+    for edge, kind, axis, point, value in (
+        ((0, 1), REVOLUTE, (0, 0, 1), (0.3, 0.3, 0), angles),
+        ((1, 2), REVOLUTE, (0, 1, 0), (-0.2, 0.35, 0), turn),
+        ((0, 3), PRISMATIC, (0, 1, 0), None, slide),
     ):
         rows = field[:, edges[frozenset(edge)]]
         assert (rows[:, TYPE] == kind).all()
         assert abs(rows[0, AXIS] @ axis) == pytest.approx(1, abs=1.4e-3)
-        np.testing.assert_allclose(np.abs(rows[:, VALUE]), value, atol=off)
+        np.testing.assert_allclose(np.abs(rows[:, VALUE]), value, atol=0.02)
         if point is not None:
-            assert np.linalg.norm(np.cross(rows[0, POINT] - point, axis)) < 0.03
+            off = np.cross(rows[0, POINT] - point, axis)
+            assert np.linalg.norm(off) < 0.02
     whole = about((0.6, 0, 0.8), 0.8) @ along((1, 0, 0), 0.2)
     assert abs(field[4, edges[frozenset((0, 3))], AXIS] @ whole[:3, :3] @ [0, 1, 0]) == pytest.approx(1, abs=1.4e-3)
 
@@ -169,3 +171,11 @@ def test_motions_of_many_pairs_are_averaged():
     many = PartsSample(said.probability, np.array(pairs), motion, [])
     apart = [np.abs(part_trajectories(sequence, one).motion - truth).mean() for one in (few, many)]
     assert apart[1] < 0.75 * apart[0] and part_trajectories(sequence, many).disagreement.min() > 0.003
+
+
+def test_a_plate_has_its_normal_and_both_edges_as_directions():
+    turn = about((0.6, 0.8, 0), 0.7)[:3, :3]
+    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T
+    found = directions_and_edges(plate)
+    assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
+    assert len(distinct_directions(found)) == 3

@@ -8,9 +8,11 @@ import numpy as np
 
 from dpcli.segment.frame_pairs import sequence_scale
 from dpcli.segment.kinematics.joint_fit import JointFit
+from dpcli.segment.kinematics.kinematic_tree import KinematicTree
 from dpcli.segment.kinematics.part_trajectories import Trajectories
-from dpcli.segment.kinematics.point_fit import NUMBER_PRICE, PointFit
+from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.segment.multibody.frames import Frames
+from dpcli.segment.multibody.point_fit import NUMBER_PRICE, PointFit
 from dpcli.store import CloudSequence
 from dpcli.store.joints import PRISMATIC, REVOLUTE
 
@@ -18,7 +20,19 @@ _FRAMES = 12  # of a sequence that are looked at
 _MOST = 256  # points of a part in a frame
 _FEWEST = 9  # points that make a surface
 _ALONG_NOTHING = 3 * NUMBER_PRICE  # what a free axis must save: its two numbers, and it is rare
+_KNOWN = np.cos(np.radians(4))  # of the directions: no surface tells them better
 _STEPS, _STEPS_ALONG, _WIDE = 10, 6, 1.5  # of a fit, of one along a direction, and the first residual in spacings
+
+
+def with_point_axes(sequence: CloudSequence, tree: KinematicTree) -> KinematicTree:
+    """Returns the tree with the axes of hinges and slides that the points of both parts say (`SeenParts.with_axis`)."""
+    seen, joints = SeenParts(sequence, tree.trajectories), []
+    directions = [directions_and_edges(cloud) for cloud in tree.points]
+    for joint in tree.joints:
+        larger = sorted((joint.parent, joint.child), key=lambda k: -len(tree.points[k]))  # it tells directions better
+        both = distinct_directions(np.concatenate([directions[k] for k in larger]))
+        joints.append(replace(joint, fit=seen.with_axis(joint.parent, joint.child, joint.fit, both)))
+    return replace(tree, joints=joints)
 
 
 class SeenParts:
@@ -41,12 +55,14 @@ class SeenParts:
         """Returns a hinge or slide between two parts (rows of `Trajectories`) with the axis that all points say.
 
         The joint is fitted to the points of both parts, whose motions are not exact either, with a free axis and along each
-        of the directions f64 (D,3). A free axis is taken where it saves enough. Joints of other types stay as they are.
+        of the directions f64 (D,3). A free axis is taken where it saves enough. A joint that lies
+        along what is taken, or costs little more, stays as it is, as do those of other types.
         """
         if self._frames is None or fit.kind not in (REVOLUTE, PRISMATIC):
             return fit
         masks = [self._part == self._ids[k] for k in (parent, child)]
         best = PointFit(self._frames, masks[1], self._trajectory(parent), self._scaled(fit), parent=masks[0])
+        given = self._cost(best, masks)
         best.run(_STEPS, _WIDE)
         first, least = best, self._cost(best, masks) + _ALONG_NOTHING
         for direction in directions:
@@ -56,7 +72,11 @@ class SeenParts:
             along.run(_STEPS_ALONG, _WIDE)
             if (cost := self._cost(along, masks)) < least:
                 best, least = along, cost
-        return self._unscaled(fit, best.joint)
+        if best is first:
+            same = given - self._cost(first, masks) < 4 * NUMBER_PRICE  # those of its line
+        else:
+            same = abs(best.joint.axis @ fit.axis) > _KNOWN
+        return fit if same else self._unscaled(fit, best.joint)
 
     def _cost(self, fit: PointFit, masks: list[np.ndarray]) -> float:
         """Returns what the points of parent and child cost."""
