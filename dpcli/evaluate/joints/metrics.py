@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,8 +20,9 @@ class JointStatistics:
 
     joints: true joints of parts that are seen; edges: those whose two parts a predicted joint connects, of `predicted`
     predicted ones; types: those of the right type, too; axes: true hinges and slides; near: those whose predicted axis is of
-    the right type and within 5 degrees. angles (degrees), distances (hinges, length_unit), turns (degrees) and slides
-    (length_unit): errors of the joints of the right type.
+    the right type and within 5 degrees. visible, visible_types, visible_axes, visible_near: the same of the joints that
+    move visibly. angles (degrees), distances (hinges, length_unit), turns (degrees) and slides (length_unit): errors of the
+    joints of the right type.
     """
 
     joints: int = 0
@@ -29,6 +31,10 @@ class JointStatistics:
     types: int = 0
     axes: int = 0
     near: int = 0
+    visible: int = 0
+    visible_types: int = 0
+    visible_axes: int = 0
+    visible_near: int = 0
     angles: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
@@ -40,12 +46,16 @@ class JointStatistics:
 
 
 def joint_statistics(
-    true_part: np.ndarray, true_joint: np.ndarray, part: np.ndarray, joint: np.ndarray
+    true_part: np.ndarray,
+    true_joint: np.ndarray,
+    part: np.ndarray,
+    joint: np.ndarray,
+    moves_visibly: Callable[[int, int], bool] = lambda child, parent: False,
 ) -> JointStatistics:
     """Returns the errors of a sequence's predicted joints f64 (T,K,9), of parts i (P), beside the true ones f64 (T,G,9).
 
     Predicted parts are matched to true ones over all frames by IoU, one to one, at 0.5 or more. An edge counts in either
-    direction: which of two parts holds the other can't be seen.
+    direction: which of two parts holds the other can't be seen. moves_visibly: of a true child and its parent.
     """
     name = _true_names(true_part, part)
     seen = set(np.unique(true_part[true_part >= 0]).tolist())
@@ -57,16 +67,19 @@ def joint_statistics(
     for edge, child in true_edges.items():
         truth = true_joint[:, child]
         moves = int(truth[0, TYPE]) in (REVOLUTE, PRISMATIC)
+        types, near = found.types, found.near
         found.axes += moves
-        if edge not in edges:
-            continue
-        found.edges += 1
-        guess = joint[:, edges[edge]]
-        if truth[0, TYPE] != guess[0, TYPE]:
-            continue
-        found.types += 1
-        if moves:
-            _compare(truth, guess, name[edges[edge]] == child, found)
+        if edge in edges:
+            found.edges += 1
+            guess = joint[:, edges[edge]]
+            found.types += int(truth[0, TYPE] == guess[0, TYPE])
+            if moves and found.types > types:
+                _compare(truth, guess, name[edges[edge]] == child, found)
+        if moves_visibly(child, int(truth[0, PARENT])):
+            found.visible += 1
+            found.visible_axes += moves
+            found.visible_types += found.types - types
+            found.visible_near += found.near - near
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,19 +11,31 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric, ratios_of_sums
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
+from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
 from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences
+from dpcli.store import CloudSequence, CloudsReader
 
-METRICS = ("type", "axis_within_5", "edge_f1", "axis_angle", "axis_position", "state_angle", "state_length")
+METRICS = (
+    "type",
+    "axis_within_5",
+    "visible_type",
+    "visible_axis_within_5",
+    "edge_f1",
+    "axis_angle",
+    "axis_position",
+    "state_angle",
+    "state_length",
+)
 
 
 @dataclass
 class JointReport:
     """Holds the metrics of all sequences and of those of each label.
 
-    metrics: shares 0..1 (type, axis_within_5, edge_f1), degrees (axis_angle, state_angle) and length_unit (axis_position,
-    state_length); NaN where nothing counts.
+    metrics: shares 0..1 (type, axis_within_5, the same of visible joints, edge_f1), degrees (axis_angle, state_angle) and
+    length_unit (axis_position, state_length); NaN where nothing counts. poses: whether the truth tells what is visible.
     """
 
     split: str
@@ -38,6 +50,7 @@ class JointReport:
     counts: dict[int, JointStatistics]
     resampling: Resampling
     intervals: dict[str, Interval] = field(default_factory=dict)
+    poses: bool = True
 
 
 def evaluate_joints(
@@ -58,12 +71,13 @@ def evaluate_joints(
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=("part", "joint")) as paired:
         if "joint" not in paired.predicted.fields:
             raise DataError(f"{path}: no joints in it; `dpc segment joints {path} -o joints.h5` finds them")
-        for place, (row, _) in enumerate(paired.rows):
+        for place, (row, other) in enumerate(paired.rows):
             pair = paired.pair(place)
             joint = paired.predicted.read(row, fields=("joint",)).joint
             names.append(pair.truth.name)
             labels.append(pair.truth.label)
-            found.append(joint_statistics(pair.truth.part, pair.truth.joint, pair.predicted.part, joint))
+            visible = _visibly(paired.truth, other, pair.truth)
+            found.append(joint_statistics(pair.truth.part, pair.truth.joint, pair.predicted.part, joint, visible))
     total = sum(found, JointStatistics())
     if not total.joints:
         raise DataError(f"{truth}: no joint between two parts that are seen; nothing to compare")
@@ -84,7 +98,21 @@ def evaluate_joints(
         counts,
         resampling,
         resampling.intervals(_weighted(found), len(found)),
+        "pose" in paired.truth.fields,
     )
+
+
+def _visibly(reader: CloudsReader, row: int, truth: CloudSequence) -> Callable[[int, int], bool]:
+    """Returns whether a sequence's child moves visibly against its parent; nobody knows without poses: never."""
+    pose = reader.read(row, fields=("pose",)).pose if "pose" in reader.fields else None
+
+    def moves(child: int, parent: int) -> bool:
+        try:
+            return pose is not None and joint_visibility(truth, pose, child, parent) >= VISIBLE
+        except DataError as error:
+            raise DataError(f"{reader.path}: {error}; make the file again") from None
+
+    return moves
 
 
 def _sums(found: Sequence[JointStatistics]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -92,6 +120,8 @@ def _sums(found: Sequence[JointStatistics]) -> tuple[dict[str, np.ndarray], dict
     pairs = {
         "type": [(one.types, one.joints) for one in found],
         "axis_within_5": [(one.near, one.axes) for one in found],
+        "visible_type": [(one.visible_types, one.visible) for one in found],
+        "visible_axis_within_5": [(one.visible_near, one.visible_axes) for one in found],
         "edge_f1": [(2 * one.edges, one.joints + one.predicted) for one in found],
         "axis_angle": [(sum(one.angles), len(one.angles)) for one in found],
         "axis_position": [(sum(one.distances), len(one.distances)) for one in found],

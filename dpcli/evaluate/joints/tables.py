@@ -7,15 +7,17 @@ from typing import Any
 
 from dpcli.evaluate.joints.metrics import JointStatistics
 from dpcli.evaluate.joints.protocol import METRICS, JointReport
+from dpcli.evaluate.joints.visibility import VISIBLE
 from dpcli.evaluate.results import intervals_json, left_out_json, left_out_note, none_if_nan, samples_json
 from dpcli.evaluate.segmentation.tables import class_rows
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
 
-_SHARES = ("type", "axis_within_5", "edge_f1")
+_SHARES = ("type", "axis_within_5", "visible_type", "visible_axis_within_5", "edge_f1")
 _NOTE = (
     "Parts are matched over all frames at IoU 0.5. A joint that connects other parts, or none, has the wrong type and no "
     "axis within 5 degrees. Axis angle, axis position (the least distance between the two axes of a hinge) and value "
-    "(since frame 0, mean over the frames): of the joints of the right type, in the coordinates of frame 0."
+    "(since frame 0, mean over the frames): of the joints of the right type, in the coordinates of frame 0. Visible: joints "
+    f"whose motion takes the child's points at least {VISIBLE:g} times the sampling distance, by the truth's poses."
 )
 
 
@@ -24,6 +26,8 @@ def _titles(unit: str) -> dict[str, str]:
     return {
         "type": "type right",
         "axis_within_5": "axis within 5 deg",
+        "visible_type": "type, visible",
+        "visible_axis_within_5": "axis, visible",
         "edge_f1": "tree edges F1",
         "axis_angle": "axis angle (deg)",
         "axis_position": f"axis position{of}",
@@ -65,6 +69,9 @@ def joint_notes(report: JointReport) -> list[str]:
     return [
         f"Split {report.split!r}, truth: {report.truth}. {total.joints} true joints of {len(report.names)} sequences, "
         f"{total.predicted} predicted, {total.edges} between the right parts.",
+        f"{total.visible} true joints move visibly."
+        if report.poses
+        else "Which joints move visibly is unknown: the truth has no poses.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         _NOTE,
         *(left_out_note(entry, "sequences") for entry in report.left_out),
@@ -90,7 +97,13 @@ def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()
     return {
         "task": "joints",
         "input": source,
-        "protocol": {"split": report.split, "truth": report.truth, "iou_threshold": 0.5, "axis_within": 5},
+        "protocol": {
+            "split": report.split,
+            "truth": report.truth,
+            "iou_threshold": 0.5,
+            "axis_within": 5,
+            "visible": VISIBLE,
+        },
         "metrics": _numbers(report.metrics) | {"per_class": rows},
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
@@ -112,4 +125,6 @@ def _counts(total: JointStatistics) -> dict[str, int]:
         "joints_between_the_right_parts": total.edges,
         "joints_of_the_right_type": total.types,
         "true_axes": total.axes,
+        "visible_joints": total.visible,
+        "visible_axes": total.visible_axes,
     }

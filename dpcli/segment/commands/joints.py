@@ -14,6 +14,7 @@ from dpcli.runtime.whole_file import make_folder, refuse_existing, whole_file
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
+from dpcli.segment.multibody.axis_choice import with_point_axes
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
 
@@ -64,7 +65,7 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
             sequence = reader.read(index)
             if not (sequence.part >= 0).any():
                 raise DataError(f"{reader.path}: {sequence.name!r} has no point in any part; predict its parts first")
-            tree = kinematic_tree(sequence, reader.read_parts(index))
+            tree = with_point_axes(sequence, kinematic_tree(sequence, reader.read_parts(index)))
             counts.update(joint_counts(tree))
             if picture is not None and number == 0:
                 joints_picture(picture, tree, sequence.name)

@@ -10,6 +10,9 @@ _COSINE = np.cos(np.radians(12))  # of the normals that make one direction
 _NORMALS = 3  # directions of normals of a part
 _FEWEST = 9  # points that make a surface
 _ACROSS = 0.3  # least sine between two normals whose cross product is a direction
+_ALIKE = np.cos(np.radians(10))  # of directions that count as one
+_ANGLES = np.radians(np.arange(90))  # of a rectangle's edges that are tried
+_ENDS = 0.01  # share of the points that may lie outside a rectangle, on each side
 
 
 def surface_directions(points: np.ndarray) -> np.ndarray:
@@ -30,6 +33,36 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
     crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
     found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
     return np.stack(found)
+
+
+def directions_and_edges(points: np.ndarray) -> np.ndarray:
+    """Returns the part's surface directions, and the edges of a plate across the most frequent, f64 (D,3)."""
+    found = surface_directions(points)
+    return np.concatenate([found, _plate_edges(points - points.mean(0), found[0])]) if len(found) else found
+
+
+def distinct_directions(directions: np.ndarray) -> np.ndarray:
+    """Returns the unit vectors (D,3) that lie more than 10 degrees, of either sign, from all before them.
+
+    >>> distinct_directions(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
+    chosen: list[int] = []
+    for k, direction in enumerate(directions):
+        if not chosen or (np.abs(directions[chosen] @ direction) <= _ALIKE).all():
+            chosen.append(k)
+    return directions[chosen]
+
+
+def _plate_edges(centered: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Returns the directions (2,3) of the least rectangle around points (n,3), seen along a normal.
+
+    A plate has one normal, and turns about one of its edges.
+    """
+    plane = np.linalg.svd(normal[None])[2][1:]
+    turns = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), -np.sin(_ANGLES), np.cos(_ANGLES)], 1).reshape(-1, 2, 2)
+    low, high = np.quantile(turns @ (plane @ centered.T), [_ENDS, 1 - _ENDS], axis=2)
+    return turns[(high - low).prod(1).argmin()] @ plane
 
 
 def _mean_direction(normals: np.ndarray, first: np.ndarray) -> np.ndarray:

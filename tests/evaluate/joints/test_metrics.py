@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
 from dpcli.evaluate.joints.protocol import joint_metrics
+from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
+from dpcli.store import CloudSequence
 from dpcli.store.joints import AXIS, FIXED, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE, no_joints
 
 PART = np.repeat([0, 1, 2], 20)
@@ -63,3 +66,25 @@ def test_wrong_types_and_unmatched_parts_count_as_missed():
     assert (found.joints, found.edges, found.predicted) == (2, 0, 0)
     total = found + JointStatistics(joints=2, types=2)
     assert joint_metrics([total])["type"] == 0.5 and np.isnan(joint_metrics([found])["axis_angle"])
+
+
+def test_joints_that_move_visibly_have_their_own_denominator():
+    near = joints((1, 0, REVOLUTE, (0, 0, 1), (1, 0, 0), (0.1, 0.6)), (2, 0, FIXED, (0, 0, 0), (0, 0, 0), 0))
+    found = joint_statistics(PART, TRUTH, PART, near, lambda child, parent: (child, parent) == (1, 0))
+    assert (found.joints, found.types, found.near, found.axes) == (2, 1, 1, 2)
+    assert (found.visible, found.visible_types, found.visible_near, found.visible_axes) == (1, 1, 1, 1)
+    both = joint_metrics([found])
+    assert (both["type"], both["visible_type"], both["visible_axis_within_5"]) == (0.5, 1, 1)
+    assert np.isnan(joint_metrics([joint_statistics(PART, TRUTH, PART, near)])["visible_type"])
+
+
+def test_a_motion_below_the_distance_between_points_is_not_visible():
+    rng, pose = np.random.default_rng(0), np.tile(np.eye(4), (3, 3, 1, 1))
+    pose[:, 1, 2, 3], pose[:, 2, 2, 3] = (0, 0.3, 0.6), (0, 0.004, 0.008)
+    clouds = [rng.uniform(0, 1, (300, 3)) * (1, 1, 0) + pose[t, PART[::5].repeat(25), :3, 3] for t in range(3)]
+    part = [PART[::5].repeat(25).astype(np.int16)] * 3
+    truth = CloudSequence.from_frames("sheets", [cloud.astype(np.float32) for cloud in clouds], part=part)
+    assert joint_visibility(truth, pose, 1, 0) > 2 * VISIBLE
+    assert 0.9 < joint_visibility(truth, pose, 2, 0) < 1.15
+    with pytest.raises(DataError, match="poses of 2 parts"):
+        joint_visibility(truth, pose[:, :2], 2, 0)

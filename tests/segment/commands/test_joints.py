@@ -49,7 +49,10 @@ def test_true_parts_give_true_joints(truth, parts, tmp_path, dpc_here):
     assert b"revolute" in found.stdout and (tmp_path / "j.png").stat().st_size > 5000
     scored = dpc_here("evaluate", "joints", tmp_path / "joints.h5", "--truth", truth, "--split", "all", "--json")
     assert scored.returncode == 0, scored.stderr
-    metrics = json.loads(scored.stdout)["metrics"]
+    report = json.loads(scored.stdout)
+    metrics = report["metrics"]
+    assert 0 < report["denominators"]["visible_joints"] <= report["denominators"]["true_joints"]
+    assert metrics["visible_type"] > 0.8
     assert metrics["type"] > 0.8 and metrics["axis_angle"] < 1 and metrics["state_angle"] < 0.5
     shown = dpc_here("evaluate", "joints", tmp_path / "joints.h5", "--truth", truth, "--split", "all")
     assert b"axis within 5 deg" in shown.stdout

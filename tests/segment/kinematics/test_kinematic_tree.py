@@ -10,6 +10,7 @@ from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories
 from dpcli.segment.kinematics.registration import Registration
+from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
 
@@ -170,3 +171,11 @@ def test_motions_of_many_pairs_are_averaged():
     many = PartsSample(said.probability, np.array(pairs), motion, [])
     apart = [np.abs(part_trajectories(sequence, one).motion - truth).mean() for one in (few, many)]
     assert apart[1] < 0.75 * apart[0] and part_trajectories(sequence, many).disagreement.min() > 0.003
+
+
+def test_a_plate_has_its_normal_and_both_edges_as_directions():
+    turn = about((0.6, 0.8, 0), 0.7)[:3, :3]
+    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T
+    found = directions_and_edges(plate)
+    assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
+    assert len(distinct_directions(found)) == 3
