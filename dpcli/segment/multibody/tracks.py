@@ -16,6 +16,8 @@ _AROUND = 8  # tracks that carry one that a frame doesn't show
 _GUESSED = 0.02  # weight of a place where no frame shows the track
 _ROUNDS, _OWN = 3, 0.7  # in which tracks choose their parts again; share of their own deviation beside their neighbors'
 _WIDE, _STIFF = 9.0, 0.1  # squared deviation that counts one half: of the median; of the setting `flexible`, at least
+_WIDE_PAIR, _STIFF_PAIR = 4.0, 0.05  # the same where two parts may be one
+_REFITS, _LOST = 4, 0.2  # fits of one motion, without its outliers; share of a part's tracks that a union may lose
 
 
 @dataclass(frozen=True)
@@ -68,15 +70,17 @@ def _carried(before: np.ndarray, now: np.ndarray, both: np.ndarray, missing: np.
     return np.einsum("mij,mj->mi", motion[:, :, :3], before[missing]) + motion[:, :, 3]
 
 
-def fit_motions(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def fit_motions(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Returns the rigid motions (B,3,4) that take source (B,n,3) nearest to target (B,n,3), in the least squares.
 
-    Fewer than four points, which hold no turn surely, are shifted.
+    weights: f (B,n), of points. Fewer than four points, which hold no turn surely, are shifted.
     """
-    a, b = source.mean(1), target.mean(1)
+    weights = np.ones(source.shape[:2]) if weights is None else weights
+    weights = (weights / weights.sum(1, keepdims=True))[..., None]
+    a, b = (weights * source).sum(1), (weights * target).sum(1)
     rotation = np.tile(np.eye(3), (len(source), 1, 1))
     if source.shape[1] >= _FEWEST:
-        left, _, right = np.linalg.svd(np.swapaxes(target - b[:, None], 1, 2) @ (source - a[:, None]))
+        left, _, right = np.linalg.svd(np.swapaxes(target - b[:, None], 1, 2) @ (weights * (source - a[:, None])))
         left[:, :, 2] *= np.where(np.linalg.det(left @ right) < 0, -1, 1)[:, None]
         rotation = left @ right
     return np.concatenate([rotation, (b - (rotation @ a[..., None])[..., 0])[..., None]], 2)
@@ -86,27 +90,26 @@ def parts_of_tracks(tracks: Tracks, settings: MultibodySettings) -> np.ndarray:
     """Returns the part i64 (M) of each track, the largest first: patches that bend little when they move as one.
 
     They are joined from the frame that shows most tracks; those that it doesn't show follow the ones that go beside them.
-    Then each track chooses among the parts around it by how well they explain where it was seen.
+    Then each track chooses among the parts around it by how well they explain where it was seen, and parts become one
+    where one motion explains nearly all tracks of both.
     """
     first = int(tracks.shown.sum(1).argmax())
     order = [first, *(t for t in range(len(tracks.places)) if t != first)]
     weights = np.where(tracks.shown[order], 1.0, _GUESSED)
     options = {"patches": _PATCHES, "softness": settings.flexible / _SOFT, "weights": weights}
     part = find_parts(tracks.places[order], tracks.shown[first], settings.most_bodies, **options)
-    return _choose_again(tracks, part, first, settings.flexible)
+    part = _join_again(tracks, _choose_again(tracks, part, first, settings.flexible), first, settings.flexible)
+    order = np.argsort(-np.bincount(part), kind="stable")
+    return np.argsort(order)[part]
 
 
 def _choose_again(tracks: Tracks, part: np.ndarray, first: int, flexible: float) -> np.ndarray:
     """Returns the part of each track after three rounds in which it takes the one that explains it and its neighbors best."""
-    from scipy.spatial import cKDTree
-
-    place = tracks.places[first]
-    near = cKDTree(place).query(place, min(_AROUND + 1, len(place)))[1].reshape(len(place), -1)
+    near = _near(tracks, first)
     rows = np.arange(len(part))
     for _ in range(_ROUNDS):
-        cost = np.stack([_deviation(tracks, part == k, first) for k in range(part.max() + 1)], 1)
-        scale = max(_WIDE * np.median(cost[rows, part]), (_STIFF * flexible) ** 2)
-        cost = cost / (cost + scale)  # Geman and McClure's
+        cost = np.stack([_deviation(tracks, _moves(tracks, part == k, first)) for k in range(part.max() + 1)], 1)
+        cost = _doubt(cost, max(_WIDE * np.median(cost[rows, part]), (_STIFF * flexible) ** 2))
         cost = _OWN * cost + (1 - _OWN) * cost[near].mean(1)
         around = np.zeros(cost.shape, bool)
         np.put_along_axis(around, part[near], True, 1)
@@ -114,14 +117,69 @@ def _choose_again(tracks: Tracks, part: np.ndarray, first: int, flexible: float)
         if (new == part).all():
             break
         part = np.unique(new, return_inverse=True)[1]
-    order = np.argsort(-np.bincount(part), kind="stable")
-    return np.argsort(order)[part]
+    return part
 
 
-def _deviation(tracks: Tracks, inside: np.ndarray, first: int) -> np.ndarray:
-    """Returns the mean squared distance f64 (M) of all tracks, where they are seen, from how one part moves."""
-    motion = np.stack([tracks.motion(inside, first, t) for t in range(len(tracks.places))])
-    back = np.einsum("tji,tmj->tmi", motion[:, :, :3], tracks.places - motion[:, None, :, 3])
-    weights, seen = tracks.shown[..., None], tracks.shown.sum(0)
-    middle = (weights * back).sum(0) / seen[:, None]
-    return (tracks.shown * ((back - middle) ** 2).sum(-1)).sum(0) / seen
+def _join_again(tracks: Tracks, part: np.ndarray, first: int, flexible: float) -> np.ndarray:
+    """Returns the part of each track after neighbors have become one, the two first whose union explains nearly all of both.
+
+    The sums that joined patches count the outliers of a long, bending body in full and cut it; here they count as one each.
+    """
+    inside = {k: np.flatnonzero(part == k) for k in range(part.max() + 1)}
+    own = np.concatenate([_deviation(tracks, _moves(tracks, of, first), of) for of in inside.values()])
+    scale = max(_WIDE_PAIR * np.median(own), (_STIFF_PAIR * flexible) ** 2)
+    lost = {k: _lost(tracks, of, first, scale) for k, of in inside.items()}
+    beside = np.stack([np.repeat(part, _AROUND), part[_near(tracks, first)[:, 1:]].ravel()], 1)
+    pairs, offers = {(a, b) for a, b in np.unique(np.sort(beside, 1), axis=0).tolist() if a != b}, {}
+    while pairs:
+        for a, b in pairs - offers.keys():
+            more = _lost(tracks, np.concatenate([inside[a], inside[b]]), first, scale) - lost[a] - lost[b]
+            offers[a, b] = more / min(len(inside[a]), len(inside[b]))
+        kept, gone = min(offers, key=lambda pair: (offers[pair], pair))
+        if offers[kept, gone] > _LOST:
+            break
+        inside[kept] = np.concatenate([inside[kept], inside.pop(gone)])
+        lost[kept] = _lost(tracks, inside[kept], first, scale)
+        part[inside[kept]] = kept
+        renamed = {tuple(sorted(kept if k == gone else k for k in pair)) for pair in pairs}
+        pairs = {pair for pair in renamed if pair[0] != pair[1]}
+        offers = {pair: offer for pair, offer in offers.items() if not {kept, gone} & set(pair)}
+    return np.unique(part, return_inverse=True)[1]
+
+
+def _lost(tracks: Tracks, inside: np.ndarray, first: int, scale: float) -> float:
+    """Returns how many of the tracks (index (n)) one rigid motion doesn't explain, fitted again without them."""
+    weights = np.ones(len(inside))
+    for _ in range(_REFITS):
+        deviation = _deviation(tracks, _moves(tracks, inside, first, weights), inside)
+        weights = (1 - _doubt(deviation, scale)) ** 2
+    return float(_doubt(deviation, scale).sum())
+
+
+def _doubt(deviation: np.ndarray, scale: float) -> np.ndarray:
+    """Returns from 0 to 1 how little a motion explains tracks of a squared deviation: Geman and McClure's estimator."""
+    return deviation / (deviation + scale)
+
+
+def _near(tracks: Tracks, first: int) -> np.ndarray:
+    """Returns for each track itself and the eight nearest, i64 (M,9); fewer where there are few."""
+    from scipy.spatial import cKDTree
+
+    place = tracks.places[first]
+    return cKDTree(place).query(place, min(_AROUND + 1, len(place)))[1].reshape(len(place), -1)
+
+
+def _moves(tracks: Tracks, inside: np.ndarray, first: int, weights: np.ndarray | float = 1.0) -> np.ndarray:
+    """Returns the rigid motions (F,3,4) of tracks (mask or index) from the first frame to each; weights: f (n), of these."""
+    places, both = tracks.places[:, inside], tracks.shown[:, inside] & tracks.shown[first, inside]
+    weights = np.where(both.sum(1, keepdims=True) >= _FEWEST, both, 1.0) * weights
+    return fit_motions(np.broadcast_to(places[first], places.shape), places, weights)
+
+
+def _deviation(tracks: Tracks, motions: np.ndarray, inside: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Returns the mean squared distance f64 (n) of tracks, where they are seen, from how motions (F,3,4) would take them."""
+    places, shown = tracks.places[:, inside], tracks.shown[:, inside]
+    back = (places - motions[:, None, :, 3]) @ motions[:, :, :3]
+    seen = shown.sum(0)
+    middle = (shown[..., None] * back).sum(0) / seen[:, None]
+    return (shown * ((back - middle) ** 2).sum(-1)).sum(0) / seen

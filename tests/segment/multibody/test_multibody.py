@@ -15,7 +15,7 @@ from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.search import Search, explain_sequence
 from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
-from dpcli.segment.multibody.tracks import fit_motions, follow_tracks
+from dpcli.segment.multibody.tracks import fit_motions, follow_tracks, parts_of_tracks
 from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import Refinement
 from dpcli.segment.training.trainer import rand_index
@@ -154,6 +154,24 @@ def test_small_moving_parts_of_tracks_are_found_and_nothing_else(noise):
     assert set(np.unique(labels)) == {0, 1} and right.mean() > 0.995
     still = CloudSequence.from_frames("box", [clouds[0], clouds[0]], track=[tracks[0], tracks[0]])
     assert not predicted(still)[0].any()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_long_soft_trunk_stays_one_part_beside_a_limb(seed):
+    """A trunk five times as long as thick, with waves of 0.003 in its skin, and a limb that swings at its end."""
+    rng = np.random.default_rng(seed)
+    trunk = rng.uniform([-0.6, -0.12, -0.12], [0.6, 0.12, 0.12], (900, 3))
+    whole = np.concatenate([trunk, rng.uniform([0.6, -0.06, -0.06], [1.0, 0.06, 0.06], (225, 3))])
+    limb = np.arange(len(whole)) >= 900
+    waves, phase, along = rng.normal(0, 7, (6, 3)), rng.uniform(0, 6, 6), rng.normal(0, 0.01 / 6, (6, 3))
+    clouds = []
+    for t in range(12):
+        swung = turn(0.6 * np.sin(0.9 * t), (0.0, 0.0, 1.0), (0.6, 0.0, 0.0))
+        cloud = np.where(limb[:, None], whole @ swung[:3, :3].T + swung[:3, 3], whole)
+        clouds.append(cloud + np.sin(whole @ waves.T + phase + t) @ along + [0.05 * t, 0.0, 0.0])
+    tracks = follow_tracks(clouds, [np.arange(len(whole))] * 12)
+    part = parts_of_tracks(tracks, MultibodySettings())
+    assert part.max() == 1 and (part == limb).mean() > 0.99
 
 
 def test_tracks_go_on_where_no_frame_shows_them():
