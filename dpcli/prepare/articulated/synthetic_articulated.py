@@ -14,8 +14,8 @@ from dpcli.errors import UsageError
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
 from dpcli.prepare.articulated.object_splits import SplitRule
-from dpcli.prepare.articulated.procedural_kinds import KINDS
-from dpcli.prepare.articulated.solids import Builder
+from dpcli.prepare.articulated.procedural.kinds import KINDS
+from dpcli.prepare.articulated.procedural.solids import Builder
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.runtime.seeds import PrepareStream, generator
 
@@ -37,7 +37,7 @@ def _studied(seed: int, number: int, kinds: tuple[str, ...], options: Articulati
 class SyntheticArticulated:
     """Makes procedural objects. ``kinds``: those to make; empty for all."""
 
-    objects: int = 220
+    objects: int = 260
     sequences_per_object: int = 4
     kinds: tuple[str, ...] = ()
     articulation: Articulation = Articulation()

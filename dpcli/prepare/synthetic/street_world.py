@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.prepare.articulated.solids import ball, box, cylinder, rod
+from dpcli.prepare.articulated.procedural.solids import ball, box, cylinder, rod
 
 _ROAD = 7.0  # meters between the curbs
 _LENGTH = 120.0  # of the street, each way

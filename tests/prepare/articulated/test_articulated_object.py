@@ -26,8 +26,20 @@ from dpcli.prepare.articulated.articulated_sequence import (
     study,
 )
 from dpcli.prepare.articulated.object_splits import SplitRule
-from dpcli.prepare.articulated.procedural_kinds import KINDS
-from dpcli.prepare.articulated.solids import Builder, X, Y, Z, ball, box, cylinder, open_box, plate, ring, rod
+from dpcli.prepare.articulated.procedural.kinds import KINDS
+from dpcli.prepare.articulated.procedural.solids import (
+    Builder,
+    X,
+    Y,
+    Z,
+    ball,
+    box,
+    cylinder,
+    open_box,
+    plate,
+    ring,
+    rod,
+)
 from dpcli.prepare.articulated.synthetic_articulated import SyntheticArticulated, build_object
 from dpcli.prepare.articulated.urdf import load_object, read_skeleton
 from dpcli.prepare.meshes.surface_points import Camera, choose_on_surface, choose_visible, points_on

@@ -17,7 +17,7 @@ def articulated(
     *,
     objects: Annotated[
         int, typer.Option("--objects", min=1, max=100_000, help="Different objects, the kinds in turn.")
-    ] = 220,
+    ] = 260,
     sequences_per_object: SequencesPerObject = 4,
     kinds: Annotated[
         str, typer.Option("--kinds", help="Make only these kinds, such as laptop,scissors,lamp. Default: all 22.")

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dpcli.prepare.articulated.solids import (
+from dpcli.prepare.articulated.procedural.machine_kinds import chain, robot, switch, vehicle
+from dpcli.prepare.articulated.procedural.solids import (
     Builder,
     X,
     Y,
@@ -461,6 +462,7 @@ KINDS: dict[str, Callable[[Builder, Rng], None]] = {
         cabinet,
         carton,
         cart,
+        chain,
         chair,
         chest,
         clock,
@@ -471,9 +473,12 @@ KINDS: dict[str, Callable[[Builder, Rng], None]] = {
         knife,
         lamp,
         laptop,
+        robot,
         scissors,
         stapler,
+        switch,
         tap,
+        vehicle,
         window,
     )
 }
