@@ -55,8 +55,8 @@ class SeenParts:
         """Returns a hinge or slide between two parts (rows of `Trajectories`) with the axis that all points say.
 
         The joint is fitted to the points of both parts, whose motions are not exact either, with a free axis and along each
-        of the directions f64 (D,3). A free axis is taken where it saves enough. A joint that lies
-        along what is taken, or costs little more, stays as it is, as do those of other types.
+        of the directions f64 (D,3). A free axis is taken where it saves enough. A joint that lies along what is taken, or
+        costs little more, stays as it is, as do those of other types.
         """
         if self._frames is None or fit.kind not in (REVOLUTE, PRISMATIC):
             return fit

@@ -33,9 +33,18 @@ class Tracks:
 
     def motion(self, inside: np.ndarray, t: int, u: int) -> np.ndarray:
         """Returns the rigid motion (3,4) from frame t to frame u of the tracks that the mask (M) names."""
-        both = inside & self.shown[t] & self.shown[u]
-        chosen = both if both.sum() >= _FEWEST else inside
-        return fit_motions(self.places[t, chosen][None], self.places[u, chosen][None])[0]
+        return self.motions(inside, t, [u])[0]
+
+    def motions(
+        self, inside: np.ndarray, t: int, frames: slice | list[int] = slice(None), weights: np.ndarray | float = 1.0
+    ) -> np.ndarray:
+        """Returns the rigid motions (F,3,4) of tracks, mask or index, from frame t to each of some; weights: f (n), of these.
+
+        Tracks that one of both frames doesn't show don't count, unless too few are left to hold a motion.
+        """
+        places, both = self.places[frames][:, inside], self.shown[frames][:, inside] & self.shown[t, inside]
+        weights = np.where(both.sum(1, keepdims=True) >= _FEWEST, both, 1.0) * weights
+        return fit_motions(np.broadcast_to(self.places[t, inside], places.shape), places, weights)
 
 
 def follow_tracks(clouds: list[np.ndarray], tracks: list[np.ndarray]) -> Tracks:
@@ -108,7 +117,7 @@ def _choose_again(tracks: Tracks, part: np.ndarray, first: int, flexible: float)
     near = _near(tracks, first)
     rows = np.arange(len(part))
     for _ in range(_ROUNDS):
-        cost = np.stack([_deviation(tracks, _moves(tracks, part == k, first)) for k in range(part.max() + 1)], 1)
+        cost = np.stack([_deviation(tracks, tracks.motions(part == k, first)) for k in range(part.max() + 1)], 1)
         cost = _doubt(cost, max(_WIDE * np.median(cost[rows, part]), (_STIFF * flexible) ** 2))
         cost = _OWN * cost + (1 - _OWN) * cost[near].mean(1)
         around = np.zeros(cost.shape, bool)
@@ -126,10 +135,11 @@ def _join_again(tracks: Tracks, part: np.ndarray, first: int, flexible: float) -
     The sums that joined patches count the outliers of a long, bending body in full and cut it; here they count as one each.
     """
     inside = {k: np.flatnonzero(part == k) for k in range(part.max() + 1)}
-    own = np.concatenate([_deviation(tracks, _moves(tracks, of, first), of) for of in inside.values()])
+    own = np.concatenate([_deviation(tracks, tracks.motions(of, first), of) for of in inside.values()])
     scale = max(_WIDE_PAIR * np.median(own), (_STIFF_PAIR * flexible) ** 2)
     lost = {k: _lost(tracks, of, first, scale) for k, of in inside.items()}
-    beside = np.stack([np.repeat(part, _AROUND), part[_near(tracks, first)[:, 1:]].ravel()], 1)
+    near = part[_near(tracks, first)]
+    beside = np.stack([np.broadcast_to(part[:, None], near.shape), near], 2).reshape(-1, 2)
     pairs, offers = {(a, b) for a, b in np.unique(np.sort(beside, 1), axis=0).tolist() if a != b}, {}
     while pairs:
         for a, b in pairs - offers.keys():
@@ -151,7 +161,7 @@ def _lost(tracks: Tracks, inside: np.ndarray, first: int, scale: float) -> float
     """Returns how many of the tracks (index (n)) one rigid motion doesn't explain, fitted again without them."""
     weights = np.ones(len(inside))
     for _ in range(_REFITS):
-        deviation = _deviation(tracks, _moves(tracks, inside, first, weights), inside)
+        deviation = _deviation(tracks, tracks.motions(inside, first, weights=weights), inside)
         weights = (1 - _doubt(deviation, scale)) ** 2
     return float(_doubt(deviation, scale).sum())
 
@@ -167,13 +177,6 @@ def _near(tracks: Tracks, first: int) -> np.ndarray:
 
     place = tracks.places[first]
     return cKDTree(place).query(place, min(_AROUND + 1, len(place)))[1].reshape(len(place), -1)
-
-
-def _moves(tracks: Tracks, inside: np.ndarray, first: int, weights: np.ndarray | float = 1.0) -> np.ndarray:
-    """Returns the rigid motions (F,3,4) of tracks (mask or index) from the first frame to each; weights: f (n), of these."""
-    places, both = tracks.places[:, inside], tracks.shown[:, inside] & tracks.shown[first, inside]
-    weights = np.where(both.sum(1, keepdims=True) >= _FEWEST, both, 1.0) * weights
-    return fit_motions(np.broadcast_to(places[first], places.shape), places, weights)
 
 
 def _deviation(tracks: Tracks, motions: np.ndarray, inside: np.ndarray | slice = slice(None)) -> np.ndarray:

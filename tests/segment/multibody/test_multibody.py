@@ -187,6 +187,9 @@ def test_tracks_go_on_where_no_frame_shows_them():
     np.testing.assert_allclose(found.motion(every, 0, 3), (motions[3] @ np.linalg.inv(motions[0]))[:3], atol=1e-9)
     apart = follow_tracks([cloud[:9], cloud[9:]], [np.arange(9), np.arange(9, 60)])  # no track in common
     assert np.isfinite(apart.places).all() and apart.shown.sum() == 60
+    for count in (1, 5, 9):  # fewer than the neighbors of a track
+        few = follow_tracks([cloud[:count], cloud[:count] + 1.0], [np.arange(count)] * 2)
+        assert (parts_of_tracks(few, MultibodySettings()) == 0).all()
     few = fit_motions(cloud[None, :2], cloud[None, :2] + [0.0, 0.0, 2.0])
     np.testing.assert_allclose(few[0], np.eye(3, 4) + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2]], atol=1e-12)
 

@@ -65,7 +65,7 @@ def _ring_link(length: float, width: float, thick: float, flat: np.ndarray) -> n
 
 
 def vehicle(b: Builder, rng: Rng) -> None:
-    """Builds a car, a bicycle or a truck with spoked wheels, doors or a tipping load."""
+    """Builds a body on two to six spoked wheels, in one row where it is narrow, with a cabin or a load that tips."""
     length, width, height = rng.uniform((0.8, 0.1, 0.1), (1.4, 0.6, 0.3))
     radius = rng.uniform(0.12, 0.25)
     b.add(0, box((length, width, height), (0, 0, radius + height / 2)))
@@ -81,7 +81,7 @@ def vehicle(b: Builder, rng: Rng) -> None:
 
 
 def _wheel(rng: Rng, radius: float) -> list[np.ndarray]:
-    """Returns the solids of a wheel about y: a tire, a hub and three to six spokes, or one with a hole beside its hub."""
+    """Returns the solids of a wheel about y: a tire, a hub and three to six spokes."""
     solids = [ring(0.85 * radius, 0.15 * radius, axis=Y), cylinder(0.2 * radius, 0.05, axis=Y)]
     spokes = int(rng.integers(3, 7))
     for k in range(spokes):
