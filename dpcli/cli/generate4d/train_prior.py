@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.options import Force, Seed
+from dpcli.cli.options import Device, Force, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.generate4d.shape.training.settings import CATALOG, PRESETS, ShapeTraining
 from dpcli.runtime.settings.catalog import Given
@@ -27,6 +27,7 @@ def train_prior(
     jobs: Annotated[
         int, typer.Option("--jobs", min=1, max=1024, help="Processes that make pictures; 1: between the steps.")
     ] = 2,
+    device: Device = "auto",
     force: Force = False,
 ) -> None:
     """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures.
@@ -39,11 +40,10 @@ def train_prior(
 
     check_sizes(settings)
     learned, held = find_meshes(meshes or [], settings.data.held_out)
-    sources = picture_sources(
-        learned, held, settings.schedule.size, seed, made=settings.data.made, moving=settings.data.moving
-    )
+    shares = {key: getattr(settings.data, key) for key in ("made", "moving", "views", "warp")}
+    sources = picture_sources(learned, held, settings.schedule.size, seed, **shares)
     models = {"models": len(learned), "held_out": sorted(file.path.name for file in held)}
     best = train_shape_prior(
-        output, settings, sources[0].make, sources[1].make, models, seed=seed, jobs=jobs, force=force
+        output, settings, sources[0].make, sources[1].make, models, seed=seed, jobs=jobs, force=force, device=device
     )
     typer.echo(best)

@@ -7,16 +7,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from dpcli.errors import UsageError
 from dpcli.generate4d.shape.model_file import load_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.training.learning_curves import COLUMNS, draw_curves
-from dpcli.generate4d.shape.training.rounds import MakeViews, make_round
+from dpcli.generate4d.shape.training.rounds import MakeModels, draw_round
 from dpcli.generate4d.shape.training.settings import CATALOG, ShapeTraining
 from dpcli.generate4d.shape.training.trainer import ShapeTrainer
 from dpcli.runtime import provenance
+from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import Generate4DStream, torch_seed
@@ -30,13 +32,14 @@ HELD_OUT_ROUND = 1 << 20  # the number of the round that validates: no training 
 def train_shape_prior(
     output: str,
     settings: ShapeTraining,
-    learned: MakeViews,
-    held: MakeViews,
+    learned: MakeModels,
+    held: MakeModels,
     models: dict[str, Any],
     *,
     seed: int,
     jobs: int,
     force: bool,
+    device: str = "cpu",
 ) -> Path:
     """Trains on the pictures that `learned` makes and returns the file of the best weights, by the pictures of `held`.
 
@@ -44,6 +47,7 @@ def train_shape_prior(
     fit each other or the folder holds another run.
     """
     check_sizes(settings)
+    where = choose_device(device)
     record = {name: asdict(group) for name, group in settings._asdict().items()}
     record = json.loads(json.dumps({**record, "seed": seed, **models}))
     folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)
@@ -54,13 +58,13 @@ def train_shape_prior(
     with folder:
         with whole_file(folder.file("settings.toml")) as part:
             part.write_text(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
-        kept = make_round(held, settings.data.validation, HELD_OUT_ROUND)
+        kept = draw_round(held(HELD_OUT_ROUND, settings.data.validation))
         weights = sum(value.numel() for value in model.parameters())
         log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")
-        batch = kept.take(range(len(kept.rgba)))
+        batch = kept.take(np.arange(len(kept.rgba)))
         with stop_requested() as stop:  # until here there is nothing to be kept, and a signal ends it at once
             trainer = ShapeTrainer(
-                model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop
+                model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop, device=where
             )
             return trainer.run()
 

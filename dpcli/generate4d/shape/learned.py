@@ -81,16 +81,19 @@ class Network:
         mirrored = other.angles.log_softmax(-1)
         mirrored[:, 0] = mirrored[:, 0].flip(-1)
         angles = choose_angles(model, (logits + mirrored) / 2)
-        depth, second = self._decode(own, cut, angles)
+        length = choose_length(model, (own.lengths.log_softmax(-1) + other.lengths.log_softmax(-1)) / 2)
+        depth, second = self._decode(own, cut, angles, length)
         opposite = angles * torch.tensor([-1.0, 1.0])
-        depth2, second2 = (x.flip(-1) for x in self._decode(other, flipped, opposite))
+        depth2, second2 = (x.flip(-1) for x in self._decode(other, flipped, opposite, length))
         gains = (own.gain + other.gain) / 2
         confidence = [probability(float(gain), *self._confidence) for gain in gains]
         depth, second = (depth + depth2) / 2, (second + second2) / 2
-        return lengthened(depth, second, cut, tilted_plane(angles, cut.shape[-1])), second, confidence
+        if not model.config.lengths:
+            depth = lengthened(depth, second, cut, tilted_plane(angles, cut.shape[-1]))
+        return depth, second, confidence
 
-    def _decode(self, encoded: Encoded, cut: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
-        depth, second = self._model.decode(encoded, cut, angles)
+    def _decode(self, encoded: Encoded, cut: Tensor, angles: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        depth, second = self._model.decode(encoded, cut, angles, length)
         return depth, second.sigmoid()
 
 
@@ -108,6 +111,11 @@ def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
     mean = (share * model.centers).sum(-1)
     spread = (share * (model.centers - mean[..., None]).square()).sum(-1).sqrt()
     return torch.where(mean.abs() > spread, mean, 0.0)
+
+
+def choose_length(model: ShapeNetwork, logits: Tensor) -> Tensor:
+    """Returns the logarithm of a clip's length (T), the same for all its frames, in the light of all: logits (T,bins)."""
+    return model.mean_length(logits.mean(0, keepdim=True)).expand(len(logits))
 
 
 def lengthened(depth: Tensor, second: Tensor, cut: Tensor, plane: Tensor) -> Tensor:

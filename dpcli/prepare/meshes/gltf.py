@@ -59,19 +59,22 @@ class Gltf:
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """Returns the top-level list of this name, such as nodes; [] when absent."""
+        return self._objects(kind, slice(None))
+
+    def _objects(self, kind: str, which: slice) -> list[dict[str, Any]]:
         value = self.tree.get(kind, [])
-        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value[which]):
             raise self.fail(f"{kind} is not a list of objects; the file is damaged, export it again")
         return value
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
         """Returns one entry of a top-level list. Raises DataError when the index points at nothing."""
-        entries = self.items(kind)
+        entries = self._objects(kind, slice(0))  # all would be looked at again for each
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(entries):
             raise self.fail(
                 f"refers to {kind}[{index}], but there are {len(entries)}; the file is damaged, export it again"
             )
-        return entries[index]
+        return self._objects(kind, slice(index, index + 1))[index]
 
     def accessor(self, index: Any, what: str, width: int | None = None, finite: bool = True) -> np.ndarray:
         """Returns numbers of an accessor: (count,) or (count, components), normalized integers as float32 in -1..1.

@@ -131,12 +131,17 @@ class FrameCaster:
         normal = np.einsum("nk,nka->na", weights, self.normals[corners])
         if self.mesh.faceted is not None:
             normal = np.where(self.mesh.faceted[triangle, None], _unit(self._across[triangle]), normal)
-        length = np.sqrt(np.einsum("na,na->n", normal, normal))
         facing = np.where(np.einsum("na,na->n", normal, direction) > 0, -1, 1)
-        half = 0.5 + 0.5 * facing * (normal @ _LIGHT) / np.maximum(length, 1e-9)
-        light = 1 - self.shading * (0.7 - 0.8 * half)  # wraps around: no side is black, as under an open sky
-        unlit = np.array([m.unlit for m in self.mesh.materials])
-        return np.where(unlit[self.mesh.material[triangle]], 1, light).astype(np.float32)
+        return light_on(self.mesh, triangle, facing[:, None] * normal, self.shading)
+
+
+def light_on(mesh: AnimatedMesh, triangle: np.ndarray, normal: np.ndarray, shading: float) -> np.ndarray:
+    """Returns how much light f32 (N) comes from points of triangles i64 (N) with normals (N,3), 1 where they are unlit."""
+    length = np.sqrt(np.einsum("na,na->n", normal, normal))
+    half = 0.5 + 0.5 * (normal @ _LIGHT) / np.maximum(length, 1e-9)
+    light = 1 - shading * (0.7 - 0.8 * half)  # wraps around: no side is black, as under an open sky
+    unlit = np.array([m.unlit for m in mesh.materials])
+    return np.where(unlit[mesh.material[triangle]], 1, light).astype(np.float32)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

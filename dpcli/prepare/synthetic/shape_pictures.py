@@ -1,6 +1,7 @@
 """Rounds of pictures with layers for the training of a shape prior: from models, moving or still, and made-up creatures.
 
-A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen.
+A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen. Its
+models are read and posed by one process and may be drawn by another, which has a GPU.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
-from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
+from dpcli.prepare.meshes.layered_views import LayeredViews, PosedMesh, draw_views, posed
 from dpcli.prepare.synthetic.creature_mesh import animated_creature, make_skin
 from dpcli.prepare.synthetic.gait import bone_motion
 from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
@@ -25,7 +27,6 @@ from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.text_files import read_text
 
 _POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
-_PER_MESH = 6  # pictures of one mesh in a round
 _MOST_MISSES = 200  # models in a row that show nothing
 _SAID: set[str] = set()  # what was said of models in this process
 _MOST_TRIANGLES = 200_000  # larger models are passed over, since one would hold up all others
@@ -40,9 +41,32 @@ class MeshFile:
 
 
 @dataclass(frozen=True)
+class PosedModels:
+    """Holds the models of a round in their poses. count: pictures of the round; views: of each model; warp: see `draw_views`."""
+
+    meshes: tuple[PosedMesh, ...]
+    count: int
+    views: int
+    size: int
+    warp: float
+    seed: int
+    number: int
+
+    def draw(self, device: torch.device | str = "cpu") -> LayeredViews:
+        """Draws the pictures of the round, in random order. Raises DataError where no model shows anything."""
+        rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, self.number, 1)
+        found = draw_views(self.meshes, self.views, self.size, rng, warp=self.warp, device=device)
+        if not len(found.rgba):
+            raise DataError(f"none of {len(self.meshes)} models shows anything; are they whole?")
+        order = np.resize(rng.permutation(len(found.rgba)), self.count)  # what shows nothing is made up for by others
+        return LayeredViews(*(part[torch.from_numpy(order).to(device)] for part in found))
+
+
+@dataclass(frozen=True)
 class PictureSource:
     """Makes rounds of pictures. made, moving: shares of made-up creatures and of animated models, 0..1; still models have
-    the rest. A folder's share grows with the root of its number of models: many of them are alike.
+    the rest. A folder's share grows with the root of its number of models: many of them are alike. views: pictures of each
+    model in a round. warp: how far proportions are changed at random.
     """
 
     files: tuple[MeshFile, ...]
@@ -50,28 +74,27 @@ class PictureSource:
     seed: int
     made: float = 0.5
     moving: float = 0.35
+    views: int = 6
+    warp: float = 0.0
 
-    def make(self, number: int, count: int) -> LayeredViews:
-        """Makes the `count` pictures of a round, in random order. Raises DataError where no model shows anything."""
+    def make(self, number: int, count: int) -> PosedModels:
+        """Poses the models of a round of `count` pictures. Raises DataError where no model shows anything."""
         rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, number)
-        parts, have, misses = [], 0, 0
-        while have < count:
+        meshes: list[PosedMesh] = []
+        misses = 0
+        while len(meshes) * self.views < count:
             with log.each_once(_SAID):
                 mesh = self._draw_mesh(rng)
-            views = draw_views(_recolored(mesh, rng), _PER_MESH, self.size, rng) if mesh is not None else None
-            if views is not None and len(views.rgba):
-                parts.append(views)
-                have += len(views.rgba)
-            else:
-                misses += 1
-                if misses > _MOST_MISSES and not have:
-                    raise DataError(
-                        f"none of {misses} models drawn shows anything; are these {len(self.files)} models whole?"
-                    )
-        order = rng.permutation(have)[:count]
-        return LayeredViews(
-            np.concatenate([part.rgba for part in parts])[order], np.concatenate([part.depth for part in parts])[order]
-        )
+            shown = posed(_recolored(mesh, rng), rng) if mesh is not None else None
+            if shown is not None:
+                meshes.append(shown)
+                continue
+            misses += 1
+            if misses > _MOST_MISSES and not meshes:
+                raise DataError(
+                    f"none of {misses} models drawn shows anything; are these {len(self.files)} models whole?"
+                )
+        return PosedModels(tuple(meshes), count, self.views, self.size, self.warp, self.seed, number)
 
     def _draw_mesh(self, rng: np.random.Generator) -> AnimatedMesh | None:
         """Draws a mesh in some poses; None where a model can't be read, which is said once per model."""
@@ -86,11 +109,19 @@ class PictureSource:
 
 
 def picture_sources(
-    learned: Sequence[MeshFile], held: Sequence[MeshFile], size: int, seed: int, *, made: float, moving: float
+    learned: Sequence[MeshFile],
+    held: Sequence[MeshFile],
+    size: int,
+    seed: int,
+    *,
+    made: float,
+    moving: float,
+    views: int = 6,
+    warp: float = 0.0,
 ) -> tuple[PictureSource, PictureSource]:
     """Returns the source to learn from and the one to validate on: held-out models alone, made-up creatures without any."""
     return (
-        PictureSource(tuple(learned), size, seed, made, moving),
+        PictureSource(tuple(learned), size, seed, made, moving, views, warp),
         PictureSource(tuple(held), size, seed, made=0.0, moving=1.0),
     )
 

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from dpcli.generate4d.shape.layers import Camera, ShapeLayers, ShapePrior
 from dpcli.generate4d.shape.learned import Network
@@ -80,7 +81,7 @@ def true_layers(caster: FrameCaster, camera: Camera, picture: np.ndarray) -> Sha
     along = hit * (rays[ray, 3:] @ camera.world_to_camera[2, :3].astype(np.float32))
     seen = np.unique(ray)
     depth = np.full((height * width, 4), np.nan)
-    depth[seen] = split_hits(ray, along, entering)
+    depth[seen] = split_hits(*(torch.from_numpy(x) for x in (ray, along, entering))).numpy()
     color = np.zeros((4, height * width, 3), np.float32)
     shown = caster.surface(triangle, weights, rays[ray, 3:])[:, :3]
     for layer in range(4):

@@ -15,6 +15,7 @@ COLUMNS = (
     "validation_loss",
     "validation_inflated",
     "validation_angle",
+    "validation_length",
     "learning_rate",
     "seconds",
 )

@@ -1,4 +1,4 @@
-"""The losses of a shape network: errors of layers and of their differences, the angles of the whole, its own gain."""
+"""The losses of a shape network: errors of layers and of their differences, angles and length of the whole, its own gain."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, inflated_layers
+from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, inflated_layers, tilted_plane
 from dpcli.generate4d.shape.training.rounds import Batch
 
 _RIDGE = 0.005  # squared sides of the picture: a narrow object has no angle to speak of
@@ -39,6 +39,21 @@ def object_angles(depth: Tensor) -> Tensor:
     return (slope / determinant[:, None]).atan()
 
 
+def object_length(batch: Batch, angles: Tensor) -> Tensor:
+    """Returns the logarithm (B) of how long objects are along the line of sight, beside their inflation.
+
+    It compares standard deviations of fronts and backs, once the plane of the angles (B,2) is taken out.
+    """
+    depth = batch.depth
+    last = torch.where(depth[:, 3].isnan(), depth[:, 1], depth[:, 3])
+    ends = torch.stack([depth[:, 0], last], 1) - tilted_plane(angles, depth.shape[-1])
+    own = ends.flatten(1)
+    middle = own.nanmean(1, keepdim=True)
+    inflated = torch.where(depth[:, 0].isnan(), torch.nan, batch.pictures[:, 4]).flatten(1)
+    ratio = (own - middle).square().nanmean(1) / inflated.square().nanmean(1)
+    return (0.5 * ratio.clamp(min=1e-6).log()).nan_to_num()
+
+
 def depth_error(depth: Tensor, truth: Tensor) -> Tensor:
     """Returns the mean error (B) of the layers that exist, weighted by layer, in sides of the picture."""
     weight = torch.tensor(_WEIGHTS, device=depth.device)[None, :, None, None] * ~truth.isnan()
@@ -58,23 +73,27 @@ def difference_error(depth: Tensor, truth: Tensor) -> Tensor:
 
 def shape_loss(model: ShapeNetwork, batch: Batch, guessed: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
     """Returns the loss and its parts. guessed: bool (D), which of the first D pictures are decoded at the network's own
-    angles; the others at the true ones. Of the pictures behind them only the angles are learned.
+    angles and length; the others at the true ones. Of the pictures behind them only these are learned.
     """
     encoded, count = model.encode(batch.pictures), len(guessed)
     truth = object_angles(batch.depth)
     angles = -(model.angle_targets(truth) * encoded.angles.log_softmax(-1)).sum(-1).mean()
-    own = model.mean_angles(encoded.angles.detach())
-    encoded = Encoded([level[:count] for level in encoded.levels], encoded.angles[:count], encoded.gain[:count])
+    length = object_length(batch, truth)
+    lengths = (
+        -(model.length_targets(length) * encoded.lengths.log_softmax(-1)).sum(-1).mean() if model.config.lengths else 0
+    )
+    own = model.mean_angles(encoded.angles.detach()), model.mean_length(encoded.lengths.detach())
+    encoded = Encoded([level[:count] for level in encoded.levels], *(part[:count] for part in encoded[1:]))
     batch = Batch(batch.pictures[:count], batch.depth[:count])
-    chosen = torch.where(guessed[:, None], own[:count], truth[:count])
-    depth, second = model.decode(encoded, batch.pictures, chosen)
+    chosen = torch.where(guessed[:, None], own[0][:count], truth[:count])
+    depth, second = model.decode(encoded, batch.pictures, chosen, torch.where(guessed, own[1][:count], length[:count]))
     error = depth_error(depth, batch.depth)
     there = ~batch.depth[:, 0].isnan()
     presence = functional.binary_cross_entropy_with_logits(second[there], (~batch.depth[:, 2].isnan()).float()[there])
     gain = gain_of(error.detach(), batch)
     certain = functional.smooth_l1_loss(encoded.gain[guessed], gain[guessed]) if guessed.any() else 0 * error.sum()
     smooth = difference_error(depth, batch.depth)
-    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + angles + 0.1 * certain
+    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + angles + lengths + 0.1 * certain
     return loss, {"depth": error.detach().mean(), "angles": angles.detach(), "second": presence.detach()}
 
 

@@ -36,6 +36,12 @@ class ShapeData:
 
     made: float = setting(0.5, "Share of made-up creatures.", least=0, most=1)
     moving: float = setting(0.35, "Share of models with animations; still models have the rest.", least=0, most=1)
+    views: int = setting(
+        6, "Pictures of each model in a round, in some poses; more are cheap on a GPU.", least=1, most=4096
+    )
+    warp: float = setting(
+        0.1, "How far smooth waves bend and swell each model, so that its proportions differ.", least=0, most=0.3
+    )
     held_out: str | None = setting(None, "A text file with models for validation alone, one path or its end a line.")
     validation: int = setting(384, "Pictures of held-out models that choose the best weights.", least=1)
     init: str | None = setting(None, "Weights to start from: a file or a folder of an earlier training.")
@@ -54,9 +60,9 @@ class ShapeTraining(NamedTuple):
 
 CATALOG = Catalog(network=ShapeConfig, schedule=ShapeSchedule, data=ShapeData)
 PRESETS = {
-    "release": {"network": ShapeConfig(), "schedule": ShapeSchedule(), "data": ShapeData()},
+    "release": {"network": ShapeConfig(lengths=True), "schedule": ShapeSchedule(), "data": ShapeData()},
     "tiny": {
-        "network": ShapeConfig(widths=(8, 16), hidden=16, bins=5),
+        "network": ShapeConfig(widths=(8, 16), hidden=16, bins=5, lengths=True),
         "schedule": ShapeSchedule(steps=20, batch=4, decoded=2, size=16, round=16, rounds=2, reuse=4),
         "data": ShapeData(validation=16),
     },

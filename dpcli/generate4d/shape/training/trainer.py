@@ -18,8 +18,8 @@ import torch
 from dpcli.generate4d.shape.model_file import save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork, inflated_layers
 from dpcli.generate4d.shape.training.confidence import calibrate
-from dpcli.generate4d.shape.training.losses import depth_error, gain_of, object_angles, shape_loss
-from dpcli.generate4d.shape.training.rounds import Batch, MakeViews, Window, open_window
+from dpcli.generate4d.shape.training.losses import depth_error, gain_of, object_angles, object_length, shape_loss
+from dpcli.generate4d.shape.training.rounds import Batch, MakeModels, Window, open_window
 from dpcli.generate4d.shape.training.settings import ShapeSchedule
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.runtime.progress import Progress, log
@@ -44,16 +44,19 @@ class ShapeTrainer:
         model: ShapeNetwork,
         folder: RunFolder,
         schedule: ShapeSchedule,
-        make: MakeViews,
+        make: MakeModels,
         held: Batch,
         notes: dict[str, Any],
         *,
         seed: int,
         jobs: int,
         stop: StopRequest,
+        device: torch.device,
     ) -> None:
-        self.model, self.mean = model, deepcopy(model).eval()
-        self.folder, self.schedule, self.make, self.held = folder, schedule, make, held
+        self.model = model.to(device, memory_format=torch.channels_last)
+        self.mean, self.device = deepcopy(self.model).eval(), device
+        self.folder, self.schedule, self.make = folder, schedule, make
+        self.held = Batch(*(tensor.to(device) for tensor in held))
         self.notes, self.seed, self.jobs, self.stop = notes, seed, jobs, stop
         self.log_every = max(1, schedule.steps // 60)
         self.per_round = max(1, schedule.round * schedule.reuse // schedule.batch)
@@ -74,7 +77,7 @@ class ShapeTrainer:
         rounds = math.ceil(sizes.steps / self.per_round)
         if self.step < sizes.steps:
             at = self.step // self.per_round
-            with open_window(self.make, sizes.round, sizes.rounds, at, rounds, self.jobs) as window:
+            with open_window(self.make, sizes.round, sizes.rounds, at, rounds, self.jobs, self.device) as window:
                 self._learn(window)
         self.folder.draw_curves()
         return self.folder.file("best.safetensors")
@@ -110,8 +113,8 @@ class ShapeTrainer:
         rng = generator(self.seed, Generate4DStream.SHAPE_STEP, self.step)
         batch = window.draw(self.schedule.batch, rng)
         guessed = torch.from_numpy(rng.random(min(self.schedule.decoded, self.schedule.batch)) < _GUESSED)
-        with reduced_products(torch.device("cpu"), self.schedule.bfloat16):
-            loss, parts = shape_loss(self.model, batch, guessed)
+        with reduced_products(self.device, self.schedule.bfloat16):
+            loss, parts = shape_loss(self.model, batch, guessed.to(self.device))
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         finite = bool(torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)))
@@ -170,20 +173,23 @@ def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[st
     """Returns measures of a network that names the angles itself, and slope and offset of its confidence.
 
     validation_loss, validation_inflated: error of its layers and of the inflation's, sides of the picture;
-    validation_angle: mean error of the turn about the vertical, degrees.
+    validation_angle: mean error of the turn about the vertical, degrees; validation_length: of the logarithm of the length.
     """
     model.eval()
-    errors, plain, turned, claimed, gained = [], [], [], [], []
+    errors, plain, turned, longer, claimed, gained = [], [], [], [], [], []
     for start in range(0, len(held.pictures), batch):
         part = Batch(*(tensor[start : start + batch] for tensor in held))
         encoded = model.encode(part.pictures)
-        angles = model.mean_angles(encoded.angles)
-        error = depth_error(model.decode(encoded, part.pictures, angles)[0], part.depth)
+        angles, length = model.mean_angles(encoded.angles), model.mean_length(encoded.lengths)
+        error = depth_error(model.decode(encoded, part.pictures, angles, length)[0], part.depth)
         errors.append(error)
         plain.append(depth_error(inflated_layers(part.pictures[:, 4]), part.depth))
-        turned.append((angles - object_angles(part.depth))[:, 0].abs().rad2deg())
+        true = object_angles(part.depth)
+        turned.append((angles - true)[:, 0].abs().rad2deg())
+        longer.append((length - object_length(part, true)).abs())
         claimed.append(encoded.gain)
         gained.append(gain_of(error, part))
-    means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned)]
-    confidence = calibrate(torch.cat(claimed).numpy(), (torch.cat(gained) > 0).numpy().astype(np.float64))
-    return dict(zip(("validation_loss", "validation_inflated", "validation_angle"), means)), confidence
+    names = ("validation_loss", "validation_inflated", "validation_angle", "validation_length")
+    means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned, longer)]
+    confidence = calibrate(torch.cat(claimed).cpu().numpy(), (torch.cat(gained) > 0).cpu().numpy().astype(np.float64))
+    return dict(zip(names, means)), confidence

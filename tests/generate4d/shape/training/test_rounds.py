@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.generate4d.shape.training.rounds import Batch, Round, Window, open_window, vary
+from dpcli.generate4d.shape.training.rounds import Batch, Window, draw_round, open_window, vary
 
 
-class _Views:
+class _Models:
     """Pictures whose red says the round's number."""
 
     def __init__(self, number: int, count: int) -> None:
-        self.rgba = np.full((count, 4, 8, 8), 255, np.uint8)
+        self.rgba = torch.full((count, 4, 8, 8), 255, dtype=torch.uint8)
         self.rgba[:, 0] = number
-        self.depth = np.zeros((count, 4, 8, 8), np.float16)
+
+    def draw(self, device: torch.device | str) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.rgba, torch.zeros_like(self.rgba).half()
 
 
 def _held(window: Window) -> list[int]:
@@ -26,14 +28,14 @@ def _held(window: Window) -> list[int]:
 
 @pytest.mark.parametrize("kept", [2, 5, 8])
 def test_a_window_that_is_opened_again_holds_what_it_would_have_held(kept):
-    with open_window(_Views, 3, kept, 0, 6, 1) as window:
+    with open_window(_Models, 3, kept, 0, 6, 1) as window:
         seen = []
         for _ in range(6):
             window.advance()
             seen.append(_held(window))
     assert len(seen[0]) == min(kept, 4) and all(len(one) <= kept for one in seen)
     for at in range(1, 6):
-        with open_window(_Views, 3, kept, at, 6, 1) as window:
+        with open_window(_Models, 3, kept, at, 6, 1) as window:
             window.advance()
             assert _held(window) == seen[at]
 
@@ -43,12 +45,12 @@ def test_what_goes_wrong_in_a_round_is_raised():
         window.advance()
 
 
-def _fail(number: int, count: int) -> _Views:
-    return _Views(number // 0, count)
+def _fail(number: int, count: int) -> _Models:
+    return _Models(number // 0, count)
 
 
 def test_a_batch_comes_from_all_rounds_and_repeats():
-    rounds = [Round(v.rgba, np.zeros((9, 8, 8), np.float16), v.depth) for v in (_Views(k, 9) for k in (0, 255))]
+    rounds = [draw_round(_Models(number, 9)) for number in (0, 255)]
     window = Window(iter(rounds), 2)
     window.advance()
     window.advance()
