@@ -8,6 +8,8 @@ import numpy as np
 
 from dpcli.runtime.settings.fields import check, setting
 
+_WAVES, _FREQUENCY = 3, 4.0  # waves of a warp; standard deviation of their frequencies, radians per unit of length
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -56,6 +58,13 @@ class Augmentation:
         "Scale and turn about the camera, so that a far body moves by meters; false: about the clip's mean.",
         name="augment_origin",
     )
+    warp: float = setting(
+        0.0,
+        "How far smooth waves bend and swell the space of a clip, so that its bodies have other proportions; 0.2 is moderate.",
+        least=0,
+        most=1,
+        name="augment_warp",
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -76,6 +85,8 @@ class Augmentation:
         angles[1] += rng.uniform(-self.turn, self.turn)
         center = np.zeros(3, np.float32) if self.origin else points.mean((0, 1))
         moved = (points - center) @ (linear @ _rotation(angles).T).astype(np.float32)
+        if self.warp:
+            moved += _waves(moved, self.warp, rng)
         moved += center + rng.uniform(-self.shift, self.shift, 3).astype(np.float32)
         if self.jitter:
             moved += (rng.standard_normal(moved.shape, np.float32) * self.jitter).clip(
@@ -106,6 +117,20 @@ PEERS = replace(NONE, scale=0.1, per_axis=True, origin=True)
 RELEASE = replace(NONE, scale=0.1, tilt=0.06, dropout=0.2)
 SPARSE = Augmentation(scale=0.25, turn=0.4, tilt=0.1, shift=0.15, jitter=0.05, dropout=0.4, crop=0.15, speed=0.35)
 AUGMENTATIONS = {"ours": Augmentation(), "sparse": SPARSE, "peers": PEERS, "release": RELEASE, "none": NONE}
+
+
+def _waves(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Returns shifts f32 like points f32 (...,3) by three random waves in space, the same at all times.
+
+    Their amplitude falls with their frequency, so that no wave folds space over.
+    """
+    total = np.zeros_like(points)
+    for _ in range(_WAVES):
+        frequency = rng.normal(0, _FREQUENCY, 3)
+        amplitude = size * rng.normal(size=3) / (1 + np.linalg.norm(frequency))
+        phase = points @ frequency.astype(np.float32) + np.float32(rng.uniform(0, 2 * np.pi))
+        total += np.sin(phase)[..., None] * amplitude.astype(np.float32)
+    return total
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from dpcli.generate4d.shape.training.confidence import probability
 
 _FILL = 0.89  # of the cut-out's side is filled by the object, as in training
 _LENGTHEN, _LONGEST = 1.5, 3.0  # power of the thickness beside the inflation's; most that an object is stretched
+_LONGER = 0.5  # standard deviations
 _TURN_COST = 1.0  # logarithm of probability, for an object that turns by one bin from a frame to the next
 
 
@@ -114,8 +115,17 @@ def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
 
 
 def choose_length(model: ShapeNetwork, logits: Tensor) -> Tensor:
-    """Returns the logarithm of a clip's length (T), the same for all its frames, in the light of all: logits (T,bins)."""
-    return model.mean_length(logits.mean(0, keepdim=True)).expand(len(logits))
+    """Returns the logarithm of a clip's length (T), the same for all its frames, in the light of all: logits (T,bins).
+
+    It is half a standard deviation above the mean: what is too short loses more of the silhouettes from the sides than what
+    is too long.
+    """
+    if not logits.shape[-1]:
+        return model.mean_length(logits)
+    share = logits.mean(0).softmax(-1)
+    mean = (share * model.length_centers).sum()
+    spread = (share * (model.length_centers - mean).square()).sum().sqrt()
+    return (mean + _LONGER * spread).expand(len(logits))
 
 
 def lengthened(depth: Tensor, second: Tensor, cut: Tensor, plane: Tensor) -> Tensor:
