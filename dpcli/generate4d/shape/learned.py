@@ -17,6 +17,7 @@ from dpcli.generate4d.shape.training.confidence import probability
 
 _FILL = 0.89  # of the cut-out's side is filled by the object, as in training
 _LENGTHEN, _LONGEST = 1.5, 3.0  # power of the thickness beside the inflation's; most that an object is stretched
+_SURE = 1.0, 1.5  # standard deviations of the turn about the vertical and of that about the horizontal
 _LONGER = 0.5  # standard deviations
 _TURN_COST = 1.0  # logarithm of probability, for an object that turns by one bin from a frame to the next
 
@@ -101,8 +102,9 @@ class Network:
 def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
     """Returns the mean angles (T,2) of a clip's frames, each in the light of all: logits (T,2,bins).
 
-    Frames of a clip err alike, so that all together count as one. An angle within one standard deviation of 0 becomes 0:
-    a turn that isn't sure costs more, seen from the side, than one that is missed.
+    Frames of a clip err alike, so that all together count as one. An angle within _SURE standard deviations of 0 becomes 0:
+    a turn that isn't sure costs more, seen from the side, than one that is missed, and of something flat, such as a sign, a
+    tilt costs most.
     """
     evidence = logits.log_softmax(-1) / len(logits)
     bins = torch.arange(logits.shape[-1])
@@ -111,7 +113,7 @@ def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
     share = (before + evidence + after).softmax(-1)
     mean = (share * model.centers).sum(-1)
     spread = (share * (model.centers - mean[..., None]).square()).sum(-1).sqrt()
-    return torch.where(mean.abs() > spread, mean, 0.0)
+    return torch.where(mean.abs() > torch.tensor(_SURE) * spread, mean, 0.0)
 
 
 def choose_length(model: ShapeNetwork, logits: Tensor) -> Tensor:

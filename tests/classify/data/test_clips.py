@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from dpcli.classify.data.augment import NONE, PEERS, Augmentation
 from dpcli.classify.data.clips import (
@@ -195,6 +196,18 @@ def test_augmentation_is_one_rigid_draw_a_clip():
     thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9, 0)(points, np.random.default_rng(3))
     assert len(np.unique(thinned[0], axis=0)) < 40 and np.isin(thinned[..., 0].round(4), points[..., 0].round(4)).all()
     assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0, 0)
+
+
+def test_a_warp_bends_space_alike_at_all_times_and_keeps_neighbors_near():
+    points = np.random.default_rng(0).normal(0, 0.3, (1, 400, 3)).astype(np.float32)
+    clip = np.concatenate([points, points[:, ::-1]])  # the same places in another order at another time
+    warped = replace(NONE, warp=0.2)(clip, np.random.default_rng(5))
+    assert np.allclose(warped[0], warped[1, ::-1], atol=1e-5)
+    moved = np.linalg.norm(warped - clip, axis=-1)
+    assert 0.01 < moved.mean() < 0.2 and moved.std() > 0.005  # neither nothing nor a shift
+    near = cKDTree(clip[0]).query(clip[0], 2)[1][:, 1]
+    before, after = (np.linalg.norm(x[0] - x[0, near], axis=-1) for x in (clip, warped))
+    assert 0.4 < (after / before).min() and (after / before).max() < 2
 
 
 def test_validation_comes_from_training_subjects_only(reader):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
@@ -9,13 +10,18 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.torch import load_file
 
+from dpcli.generate4d.commands.train_prior import train_shape_prior
+from dpcli.generate4d.shape.training.settings import PRESETS, ShapeTraining
+from dpcli.prepare.synthetic.shape_pictures import picture_sources
 from tests.support.commands import exit_code
+from tests.support.pretend_card import pretend_card
 
 WORDS = ("--preset", "tiny", "--jobs", 1)
 
@@ -83,3 +89,20 @@ def test_it_goes_on_from_weights_of_the_same_sizes_only(trained, tmp_path, capsy
 def test_mistakes_are_said(words, code, said, tmp_path, capsys):
     assert exit_code("generate4d", "train-prior", *words, "-o", tmp_path / "run", *WORDS) == code
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_card_learns_what_the_cpu_learns(tmp_path):
+    """All of a training on a pretended card: pictures, inflation, steps, validation; the same errors, row by row."""
+    settings = ShapeTraining(**PRESETS["tiny"])
+    schedule = replace(settings.schedule, steps=4, round=8, reuse=2)
+    settings = settings._replace(schedule=schedule, data=replace(settings.data, validation=6))
+    source, held = picture_sources([], [], schedule.size, 0, made=1.0, moving=0.0, views=2, warp=0.1)
+    rows = {}
+    for device in ("cpu", "cuda"):
+        with pretend_card() if device == "cuda" else contextlib.nullcontext():
+            train_shape_prior(
+                tmp_path / device, settings, source.make, held.make, {}, seed=0, jobs=1, force=False, device=device
+            )
+        rows[device] = [list(row.values())[:-1] for row in json.loads((tmp_path / device / "log.json").read_text())]
+    assert len(rows["cpu"]) == 4 and np.ptp([row[1] for row in rows["cpu"]]) > 0
+    assert np.allclose(rows["cuda"], rows["cpu"], rtol=1e-3, atol=1e-4)

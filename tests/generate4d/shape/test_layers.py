@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from dpcli.errors import DataError
+from dpcli.generate4d.shape import silhouette
 from dpcli.generate4d.shape.guidance import sample_surface
 from dpcli.generate4d.shape.layers import Camera, points_of
-from dpcli.generate4d.shape.silhouette import Flat, Inflated
+from dpcli.generate4d.shape.silhouette import Flat, Inflated, ball_thickness
 from dpcli.generate4d.shape.splats import splats_of
 from dpcli.ops.cameras import orbit_pose, pinhole
 
@@ -108,3 +110,13 @@ def test_normals_look_at_no_absent_neighbor(absent):
     alone.presence[0, 48, 48] = 1
     facing = points_of(alone, camera).normal @ camera.world_to_camera[2, :3]
     assert facing == pytest.approx([-1, 1], abs=0.01)
+
+
+def test_many_silhouettes_are_inflated_like_one():
+    """The batched form, which runs on GPUs, against the one that goes from ball to ball; bodies at the border, too."""
+    rng = np.random.default_rng(0)
+    masks = ndimage.gaussian_filter(rng.normal(size=(7, 40, 52)), (0, 3, 3)) > 0.02
+    masks[3], masks[4, :, :] = False, True
+    expected = np.stack([ball_thickness(mask) for mask in masks])
+    assert silhouette._ball_thicknesses(torch.from_numpy(masks)).numpy() == pytest.approx(expected, abs=1e-4)
+    assert silhouette.ball_thicknesses(torch.from_numpy(masks)).numpy() == pytest.approx(expected, abs=1e-5)

@@ -9,7 +9,7 @@ import torch
 from dpcli.errors import DataError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.layers import Camera, points_of
-from dpcli.generate4d.shape.learned import Network, lengthened
+from dpcli.generate4d.shape.learned import Network, choose_length, lengthened
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.silhouette import Inflated
@@ -106,3 +106,25 @@ def test_wrong_files_are_said(weights, tmp_path):
     save_weights(tmp_path / "other.safetensors", {"a": torch.zeros(1)}, {"format": "dpc-parts-1"})
     with pytest.raises(DataError, match="format 'dpc-parts-1', expected 'dpc-shape"):
         load_shape_model(tmp_path / "other.safetensors")
+
+
+def test_a_clip_has_one_length_and_rather_too_long_a_one():
+    """All frames speak for it; where they leave it open it is half a standard deviation above the mean."""
+    model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=5, lengths=True))
+    centers = model.length_centers.tolist()
+    sure, open_ = torch.full((2, 3, 5), -20.0)
+    sure[:, 3], open_[:, [1, 3]] = 0.0, 0.0
+    assert choose_length(model, sure).tolist() == pytest.approx([centers[3]] * 3, abs=1e-4)
+    middle, spread = (centers[1] + centers[3]) / 2, (centers[3] - centers[1]) / 2
+    assert choose_length(model, open_).tolist() == pytest.approx([middle + spread / 2] * 3, abs=1e-4)
+    open_[0], open_[0, 3] = -20.0, 0.0
+    assert choose_length(model, open_)[0] > middle + spread / 2
+    assert choose_length(ShapeNetwork(CONFIG), torch.zeros(3, 0)).tolist() == [0.0] * 3
+
+
+def test_a_network_that_names_lengths_goes_through_a_file(tmp_path):
+    torch.manual_seed(2)
+    config = ShapeConfig(widths=(4, 8), hidden=8, bins=5, lengths=True)
+    save_shape_model(tmp_path / "x.safetensors", ShapeNetwork(config).eval(), {"size": 32, "confidence": [0.0, 2.0]})
+    found = Network(str(tmp_path / "x.safetensors")).layers(np.stack([_disc(50, 40, 25)] * 2), _camera())
+    assert all((np.diff(layers.depth, axis=0) >= 0).all() and np.isfinite(layers.depth).all() for layers in found)

@@ -15,7 +15,8 @@ from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.learned import choose_angles
 from dpcli.generate4d.shape.network import ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.training.confidence import calibrate, probability
-from dpcli.generate4d.shape.training.losses import depth_error, object_angles
+from dpcli.generate4d.shape.training.losses import depth_error, object_angles, object_length, shape_loss
+from dpcli.generate4d.shape.training.rounds import Batch
 from dpcli.generate4d.shape.training.trainer import ShapeTrainer
 
 NONE = math.nan
@@ -90,3 +91,42 @@ def test_a_loss_that_runs_away_from_where_it_began_ends_the_training():
         ShapeTrainer._look_at(trainer, loss, True)
     with pytest.raises(DpcError, match=r"training diverged \(step 1, learning rate 1\): the loss grew to .*, from 3"):
         ShapeTrainer._look_at(trainer, 1e6, True)
+
+
+def test_the_length_of_a_turned_ellipsoid_is_that_of_its_axis():
+    """A ball has length 0, one that is drawn out along the line of sight the logarithm of by how much, however it leans."""
+    axis = (torch.arange(40) + 0.5) / 40 - 0.5
+    half = (0.16 - axis[:, None].square() - axis.square()).clamp(min=0).sqrt()
+    for factor in (0.5, 1.0, 3.0):
+        for angles in (torch.zeros(1, 2), torch.tensor([[0.6, -0.3]])):
+            depth = tilted_plane(angles, 40) + torch.stack([-half, half])[None] * factor
+            layers = torch.full((1, 4, 40, 40), NONE)
+            layers[:, :2] = torch.where(half > 0, depth, NONE)
+            batch = Batch(half.expand(1, 5, 40, 40), layers)
+            assert object_length(batch, angles).item() == pytest.approx(math.log(factor), abs=0.02)
+
+
+def test_the_length_is_learned_and_known_to_the_decoder():
+    """After some steps on long and short objects that look alike but for their color, the network names which is which."""
+    torch.manual_seed(0)
+    model = ShapeNetwork(ShapeConfig(widths=(8, 16), hidden=16, bins=9, lengths=True))
+    half = 0.2 * torch.ones(16, 16, 16)
+    long = torch.arange(16) % 2 == 0
+    reach = torch.where(long, 0.5, 0.2)[:, None, None, None]
+    depth = torch.cat([-reach, reach], 1).expand(-1, -1, 16, 16)
+    layers = torch.cat([depth, torch.full_like(depth, NONE)], 1)
+    color = torch.where(long, 1.0, 0.0)[:, None, None, None].expand(-1, 3, 16, 16)
+    batch = Batch(torch.cat([color, torch.ones(16, 1, 16, 16), half[:, None]], 1), layers)
+    optimizer = torch.optim.Adam(model.parameters(), 0.01)
+    for _ in range(60):
+        loss, _ = shape_loss(model, batch, torch.zeros(16, dtype=torch.bool))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    encoded = model.eval().encode(batch.pictures)
+    named = model.mean_length(encoded.lengths)
+    assert named[long].mean().item() == pytest.approx(math.log(2.5), abs=0.15) and named[~long].abs().mean() < 0.15
+    first, second = (
+        model.decode(encoded, batch.pictures, torch.zeros(16, 2), x)[0] for x in (0 * named, 1 + 0 * named)
+    )
+    assert ((second[:, 1] - second[:, 0]) / (first[:, 1] - first[:, 0])).mean() > 1.5
