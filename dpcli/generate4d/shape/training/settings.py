@@ -61,6 +61,13 @@ class ShapeTraining(NamedTuple):
 CATALOG = Catalog(network=ShapeConfig, schedule=ShapeSchedule, data=ShapeData)
 PRESETS = {
     "release": {"network": ShapeConfig(lengths=True), "schedule": ShapeSchedule(), "data": ShapeData()},
+    "gpu": {  # eight minutes of an H200; models are the bottleneck, so each is seen from many sides
+        "network": ShapeConfig(widths=(48, 96, 192, 320), hidden=256, lengths=True),
+        "schedule": ShapeSchedule(
+            steps=9000, batch=512, decoded=512, lr=3e-3, round=2048, rounds=24, reuse=3, bfloat16=True
+        ),
+        "data": ShapeData(views=24, warp=0.15, validation=768),
+    },
     "tiny": {
         "network": ShapeConfig(widths=(8, 16), hidden=16, bins=5, lengths=True),
         "schedule": ShapeSchedule(steps=20, batch=4, decoded=2, size=16, round=16, rounds=2, reuse=4),
