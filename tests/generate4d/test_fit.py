@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from dpcli.errors import DataError, UsageError
+from dpcli.generate4d.commands import fit
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import read_scene, scene_origin
@@ -252,3 +253,19 @@ def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monke
     monkeypatch.setattr("dpcli.generate4d.commands.fit.write_preview", full)
     done = dpc_here(*words, "--picture", tmp_path / "sheet.png")
     assert done.returncode == 3 and read_scene(scene).num_frames == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("asked", "prior", "card", "gsplat", "taken"),
+    [
+        ("auto", "network", True, False, "cpu"),
+        ("auto", "network", True, True, "auto"),
+        ("auto", "zero123", True, False, "auto"),
+        ("auto", "network", False, False, "auto"),
+        ("cuda", "network", True, False, "cuda"),
+    ],
+)
+def test_a_fit_takes_the_card_where_that_is_faster_or_asked_for(asked, prior, card, gsplat, taken, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: card)
+    monkeypatch.setattr(fit, "gsplat_available", lambda: gsplat)
+    assert fit._device(asked, prior) == taken

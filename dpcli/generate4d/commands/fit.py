@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, FitConfig, Supervision
@@ -23,6 +24,7 @@ from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
+from dpcli.ops.splatting.rasterization import gsplat_available
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
@@ -54,6 +56,7 @@ def fit_scene(
     """
     if picture is not None:
         check_target(picture, "--picture", PICTURES)
+    device = _device(device, supervision.prior)
     chosen, folder_path = choose_device(device), _run_folder(output, run)
     with input_file(views) as path:
         record = _record(path, config, supervision, seed)
@@ -132,6 +135,17 @@ def _write(output: str, scene: GaussianScene, targets: Targets, entry: dict, see
             length_unit=targets.length_unit,
             force=force,
         )
+
+
+def _device(name: str, prior: str) -> str:
+    """Returns the device's name; `auto` is the CPU, whose rasterizer is faster than a GPU's without gsplat.
+
+    Zero123's network needs a GPU all the same.
+    """
+    if name != "auto" or prior == "zero123" or not torch.cuda.is_available() or gsplat_available():
+        return name
+    log.info("fitting on the CPU; with gsplat a GPU is faster (pip install 'dpc-toolkit[gsplat]'; --device cuda)")
+    return "cpu"
 
 
 def _run_folder(output: str, run: str | None) -> Path:
