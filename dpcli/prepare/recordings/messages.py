@@ -1,4 +1,4 @@
-"""Decodes single ROS messages: points (PointCloud2, Livox), depth (Image, CompressedImage) and a camera (CameraInfo)."""
+"""Decodes single ROS messages: points (PointCloud2), depth (Image, CompressedImage) and a camera (CameraInfo)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 
-LIVOX_KINDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_KINDS)
-LIVOX_POINT = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo",)
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -28,12 +26,10 @@ _DEPTH_HEADER = struct.Struct("<iff")  # before the PNG of image_transport's com
 
 
 def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cloud:
-    """Returns the points of a PointCloud2, with colors where it has them, or of a Livox message, and the fields ``keep`` beside.
+    """Returns the points of a PointCloud2, with colors where it has them, and the fields ``keep`` beside.
 
-    Raises DataError when it holds fewer bytes or points than it says, or no x, y, z.
+    Raises DataError when it holds fewer bytes than it says, or no x, y, z.
     """
-    if hasattr(content, "points"):
-        return cloud_of_columns(path, _livox_columns(path, content), keep)
     order = ">" if content.is_bigendian else "<"
     fields = {field.name: field for field in content.fields if field.datatype in _POINT_TYPES and field.count in (0, 1)}
     step, width, height = int(content.point_step), int(content.width), int(content.height)
@@ -57,16 +53,6 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
     columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
     return cloud_of_columns(path, columns, keep)
-
-
-def _livox_columns(path: Path, content: Any) -> dict[str, np.ndarray]:
-    if len(content.points) != content.point_num:
-        raise DataError(
-            f"{path}: a cloud of {content.point_num} points has {len(content.points)}; the message is damaged"
-        )
-    return {
-        name: np.array([getattr(point, name) for point in content.points], kind) for name, kind in LIVOX_POINT.items()
-    }
 
 
 def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:

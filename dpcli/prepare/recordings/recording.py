@@ -14,7 +14,6 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
-from dpcli.prepare.recordings.messages import LIVOX_KINDS, LIVOX_POINT
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -144,29 +143,12 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            known = get_typestore(Stores.LATEST)
-            known.register(_livox_types())  # a ROS 2 bag may not hold the definitions of its types
-            reader = AnyReader([called], default_typestore=known)
+            reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
             reader.open()
         try:
             yield Recording(path, reader)
         finally:
             reader.close()
-
-
-def _livox_types() -> dict[str, Any]:
-    """Returns the types of Livox's drivers for ROS 2, as rosbags wants them."""
-    from rosbags.typesys import get_types_from_msg
-
-    words = {"u4": "uint32", "f4": "float32", "u1": "uint8"}
-    point = "\n".join(f"{words[kind]} {name}" for name, kind in LIVOX_POINT.items())
-    message = (
-        "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points"
-    )
-    types: dict[str, Any] = {}
-    for kind in LIVOX_KINDS:
-        types |= get_types_from_msg(point, kind.replace("CustomMsg", "CustomPoint")) | get_types_from_msg(message, kind)
-    return types
 
 
 @contextmanager

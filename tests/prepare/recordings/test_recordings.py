@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACE
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.recording_helpers import KINDS, START, TYPES, Messages, write_recording
 
-typesys = pytest.importorskip("rosbags.typesys")
+pytest.importorskip("rosbags")
 RNG = np.random.default_rng(0)
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
 K = [500.0, 0, 8, 0, 510, 6, 0, 0, 1]
@@ -56,51 +55,6 @@ def test_clouds_of_every_kind_of_recording_with_the_times_of_their_headers(tmp_p
     np.testing.assert_array_equal(sequence.points, np.concatenate([f.view("f4").reshape(-1, 3) for f in frames]))
     np.testing.assert_allclose(sequence.time, [0, 0.1, 0.35], atol=1e-9)
     assert reader.fields == ("time",)
-
-
-@pytest.mark.parametrize(
-    ("kind", "driver", "defined"), [(k, d, True) for k in KINDS for d in ("", "2")] + [("sqlite3", "2", False)]
-)
-def test_clouds_of_livox_lidars(tmp_path, kind, driver, defined):
-    """Messages of Livox's own drivers, whose definition the file holds, or not, as older ROS 2 bags."""
-    make, name = Messages(kind), f"livox_ros_driver{driver}/msg/Custom"
-    make.store.register(
-        typesys.get_types_from_msg(
-            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
-            name + "Point",
-        )
-        | typesys.get_types_from_msg(
-            "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points",
-            name + "Msg",
-        )
-    )
-    frames = [points_of(4 + t, seed=t).view("f4").reshape(-1, 3) for t in range(2)]
-
-    def message(points: np.ndarray, stamp: int, declared: int) -> Any:
-        made = [
-            make.make(
-                name + "Point", offset_time=9 * k, x=p[0], y=p[1], z=p[2], reflectivity=200 + k, tag=16, line=k % 4
-            )
-            for k, p in enumerate(points)
-        ]
-        rest = {"timebase": stamp, "lidar_id": 1, "rsvd": np.zeros(3, np.uint8)}
-        return make.make(name + "Msg", header=make.header(stamp), point_num=declared, points=made, **rest)
-
-    stamps = (START, START + 100_000_000)
-    content = [("/livox/lidar", s, message(f, s, len(f))) for s, f in zip(stamps, frames)]
-    path = write_recording(tmp_path / "run", kind, make, content)
-    if not defined:
-        database = next(path.glob("*.db3"))
-        with sqlite3.connect(database) as connection:
-            connection.execute("DELETE FROM message_definitions")
-        connection.close()
-    sequence = read(RecordedClouds(path, keep=("reflectivity",))).sequence
-    np.testing.assert_array_equal(sequence.points, np.concatenate(frames))
-    np.testing.assert_allclose(sequence.time, [0, 0.1], atol=1e-9)
-    assert sequence.value("field_reflectivity").tolist() == [200, 201, 202, 203, 200, 201, 202, 203, 204]
-    short = write_recording(tmp_path / "short", kind, make, [("/livox/lidar", START, message(frames[0], START, 7))])
-    with pytest.raises(DataError, match="a cloud of 7 points has 4"):
-        read(RecordedClouds(short))
 
 
 PACKED = [
@@ -221,9 +175,7 @@ def test_a_topic_is_chosen_or_the_topics_are_listed(tmp_path):
     content = [(topic, START, make.cloud(points_of(3))) for topic in ("/front", "/rear")]
     path = write_recording(tmp_path / "run", "bag", make, [*content, ("/image", START, make.image(depth16()))])
     assert read(RecordedClouds(path, topic="rear")).sequence.num_frames == 1
-    with pytest.raises(
-        DataError, match="choose one that holds clouds .PointCloud2 or Livox's. with --topic: /front, /rear"
-    ):
+    with pytest.raises(DataError, match="choose one that holds clouds .PointCloud2. with --topic: /front, /rear"):
         read(RecordedClouds(path))
     with pytest.raises(DataError, match="no topic /top; choose one"):
         read(RecordedClouds(path, topic="/top"))
