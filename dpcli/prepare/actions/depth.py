@@ -49,11 +49,6 @@ MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
-NO_DEPTH_BY_NAME = "videos whose names say infrared, color, confidence or the like and not depth, read as depth"
-_NO_DEPTH = re.compile(
-    r"infra|(?<![a-z])(ir|gr[ae]y|rgb|colou?r|conf(idence)?|amplitude|intensity|masks?|normals?)(?![a-z])",
-    re.IGNORECASE,
-)
 _OTHER_PICTURES = re.compile(
     r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
     r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
@@ -189,10 +184,6 @@ class DepthVideos:
         require_byte_order(str(item.path), depth)
         notes |= video.notes | ({} if told else doubts_of_units(depth))
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
-        if _NO_DEPTH.search(item.path.stem) and not any(
-            says_depth(part) for part in Path(item.name).with_suffix("").parts
-        ):
-            notes |= {NO_DEPTH_BY_NAME: 1}
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale

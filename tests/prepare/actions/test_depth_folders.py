@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.prepare.actions.depth import NO_DEPTH_BY_NAME, DepthVideos
+from dpcli.prepare.actions.depth import DepthVideos
 
 RNG = np.random.default_rng(0)
 
@@ -226,13 +226,3 @@ def test_folders_of_other_names_stay(tmp_path):
         write(tmp_path / "in" / name, **{"0": depth(1000)})
     write(tmp_path / "other" / "image_browsing", **{"0": depth(1000)})
     assert len(DepthVideos(inputs=(tmp_path / "in", tmp_path / "other")).items()) == 4
-
-
-@pytest.mark.parametrize(
-    ("name", "doubted"), [("ir", True), ("cam_infrared", True), ("depth_ir", False), ("iris", False)]
-)
-def test_a_lone_folder_whose_name_says_infrared_is_told(tmp_path, name, doubted):
-    folder = write(tmp_path / "set" / "anna" / name, **{"0": depth(3000), "1": depth(3001)})
-    for given in (tmp_path / "set", folder):
-        reader = DepthVideos(inputs=(given,))
-        assert (NO_DEPTH_BY_NAME in reader.read(reader.items()[0], RNG).notes) == doubted
