@@ -58,7 +58,7 @@ _EXPECTED = (
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Reads a calibration: JSON, YAML or XML of RealSense, Open3D, ROS, OpenCV, Kalibr, ScanNet's 4x4 text, COLMAP's
+    """Reads a calibration: JSON or YAML of RealSense, Open3D, ROS, OpenCV, Kalibr, ScanNet's 4x4 text, COLMAP's
     ``cameras.txt``, ``key = value`` lines, or a matrix in ``.npy`` or text; row- or column-major.
 
     Raises DataError that names what the file lacks, or declares and can't be used.
@@ -100,8 +100,6 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml"):
         data = _yaml(path, text)
-    elif text.lstrip().startswith("<"):
-        data = _xml(path, text)
     elif suffix == ".json" or text.lstrip().startswith(("{", "[{")):
         data = parse_json(text, path)
     else:
@@ -141,31 +139,6 @@ def _yaml(path: Path, text: str) -> Any:
         raise DataError(f"{path}: is not YAML ({' '.join(str(error).split())})") from None
     check_depth(data, path)
     return {_OF_SLAM.sub("", str(key)): value for key, value in data.items()} if isinstance(data, dict) else data
-
-
-def _xml(path: Path, text: str) -> Any:
-    """Returns what an XML file of OpenCV holds; a matrix has its `rows`, `cols` and `data`, as in YAML."""
-    from lxml import etree
-
-    try:
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True)
-        root = etree.fromstring(text.strip().encode("utf-8"), parser)
-    except (etree.LxmlError, ValueError) as error:
-        raise DataError(f"{path}: is not well-formed XML ({getattr(error, 'msg', None) or error})") from None
-    data = _of_element(root)
-    check_depth(data, path)
-    return data
-
-
-def _of_element(element: Any) -> Any:
-    if len(element):
-        return {str(part.tag): _of_element(part) for part in element}
-    words = (element.text or "").strip().strip('"')
-    try:
-        numbers = [float(word) for word in words.split()]
-    except ValueError:
-        return words
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _number_or_text(text: str) -> Any:
