@@ -35,7 +35,9 @@ _IN_BRACKETS = {
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 SHORTEST = 1e-4  # seconds between frames: what is shorter are days, or times of points
 _LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
-_TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
+_TIME_WORDS = frozenset(
+    "time timestamp stamp t timestamps epoch utc ts datetime date posix zeit zeitstempel uhrzeit datum heure hora fecha".split()
+)
 _NO_UNITS = _TIME_WORDS | {"gps", "unix", "posix", "local", "sensor", "since", "start"}
 _SEVERAL = re.compile(r"[\[(]\s*([\d.]+)\s*([^\W\d]+)\s*[\])]\s*$")  # such as [100 ns]
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?\s*$")
@@ -44,6 +46,7 @@ _CLOCK = re.compile(
     r"(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(?:([AP])\.?M\.?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
+_DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # with points the day stands first
 _DAY = 86_400.0
 _TICK = 1e-7
 _DAYS = ((36_526, 54_788), (730_486, 748_749))  # 2000 to 2050 as spreadsheets and as MATLAB count days
@@ -221,13 +224,15 @@ def clock_seconds(words: Sequence[str]) -> list[float]:
 
     >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["1 days 00:00:01"]), clock_seconds(["a"])
     ([86399.5, 86400.0], [86401.0], [])
+    >>> clock_seconds(["31.12.2023 23:59:59", "01.01.2024 00:00:01"])
+    [1704067199.0, 1704067201.0]
     >>> clock_seconds(["11:59:59 AM", "12:00:01 PM", "1:00:00 PM"])
     [43199.0, 43201.0, 46800.0]
     """
     found: list[float] = []
     days = 0
     for word in words:
-        match = _CLOCK.fullmatch(word.strip())
+        match = _CLOCK.fullmatch(_DAY_FIRST.sub(r"\3-\2-\1", word.strip()))
         try:
             seconds = _seconds_told(match) if match else None
         except ValueError:  # such as a month 13
