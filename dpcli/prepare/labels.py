@@ -164,9 +164,35 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
         )
     classes = {name: own[1 if divided else 0] for name, own in parts.items()}
     class_names = sorted(set(classes.values()))
+    _warn_of_classes(root, class_names, {0})
+    _warn_of_levels(root, [own[divided:] for own in parts.values()])
     splits = {name: split_called(own[0]) if divided else "" for name, own in parts.items()}
     rows = {name: Row(class_names.index(own), -1, splits[name]) for name, own in classes.items()}
     return LabelTable(root, rows, class_names)
+
+
+def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
+    """Warns where folders of another level may be the classes: all samples lie below one folder, or the folders below each
+    are the same. parts: of every name, from its class on.
+    """
+    below: dict[str, set[str]] = {}
+    for own in parts:
+        below.setdefault(own[0], set()).update(own[1:2] if len(own) > 2 else ())
+    alike = {frozenset(names) for names in below.values()}
+    same = next(iter(alike), frozenset())
+    if len(alike) != 1 or len(same) < 2 or all(map(split_called, same)):
+        return
+    listed = first_names(sorted(same))
+    if len(below) == 1:
+        (only,) = below
+        log.warn(
+            f"{root}: all samples are of one class, {only!r}; if its folders are the classes ({listed}), give {root / only}"
+        )
+    else:
+        log.warn(
+            f"{root}: the classes are {first_names(sorted(below))}; the folders below are the same in each ({listed}): if those"
+            " are the classes, say so in a table (--labels)"
+        )
 
 
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:

@@ -18,7 +18,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
-from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, tell_unclear_order
+from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, parse_names, tell_unclear_order
 
 _LISTED, _FEW = 5, 8
 _HEX = re.compile(r"(.*?)([0-9a-f]+)", re.IGNORECASE)
@@ -65,11 +65,11 @@ class Series:
 
     def numbers(self) -> np.ndarray | None:
         """Returns the running numbers in the names, i64 (F), rising; None when the names hold none, or more than one."""
-        return NumberColumns([parse_name(name) for name in self.names]).running_numbers() if self.numbered else None
+        return NumberColumns(parse_names(self.names)).running_numbers() if self.numbered else None
 
     def times(self) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (F), rising, where the names are times; None when they are not."""
-        return NumberColumns([parse_name(name) for name in self.names]).times() if self.numbered else None
+        return NumberColumns(parse_names(self.names)).times() if self.numbered else None
 
     def frame_times(self, fps: float | None) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (F): numbers in the names divided by ``fps``, so that what is missing
@@ -159,7 +159,7 @@ def is_beside(name: str) -> bool:
 def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
     """Returns the series among the names of files, largest first; names without numbers make one for each suffix."""
     groups: dict[tuple[str, str], list[Name]] = {}
-    for name in map(parse_name, names):
+    for name in parse_names(names):
         groups.setdefault((name.shape if name.numbers else "", name.suffix), []).append(name)
     if len(groups) > 1 and (hexadecimal := _counted_in_hex(names)):
         suffix = splitext(names[0])[1].lower()
@@ -311,7 +311,7 @@ def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:
 
 
 def _made_of(folder: Path, same: list[Series]) -> Series:
-    names = [parse_name(name) for one in same for name in one.names]
+    names = parse_names([name for one in same for name in one.names])
     one = _made(folder, names)
     return replace(one, pattern=one.pattern[: -len(one.suffix)] + ".*" if one.suffix else one.pattern)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,52 @@ def test_cut_fractions_and_padded_ones_are_in_the_order_of_time(nanoseconds, cut
     # cut fractions that all could be whole numbers, such as 5.9 and 5.10, can't be told from versions
     if not cut or any(name.partition(".")[2].startswith("0") for name in names):
         assert [name.removesuffix(".ply") for name in found.names] == names
+
+
+_WRITTEN = {
+    "sec_nsec": (1e9, lambda t, when: f"{t // 10**9}_{t % 10**9}"),
+    "sec_nsec, padded": (1e9, lambda t, when: f"{t // 10**9}_{t % 10**9:09d}"),
+    "sec-nsec": (1e9, lambda t, when: f"{t // 10**9}-{t % 10**9:09d}"),
+    "frame, sec_nsec": (1e9, lambda t, when: f"cam_{t // 10**9}_{t % 10**9}"),
+    "sec_usec": (1e6, lambda t, when: f"{t // 10**9}_{t % 10**9 // 1000}"),
+    "sec_msec": (1e3, lambda t, when: f"{t // 10**9}_{t % 10**9 // 10**6}"),
+    "sec_msec, padded": (1e3, lambda t, when: f"{t // 10**9}_{t % 10**9 // 10**6:03d}"),
+    "ms with fractions": (1e6, lambda t, when: f"x_Depth_{t // 10**6}.{t % 10**6 // 1000:03d}000"),
+    "us with fractions": (1e6, lambda t, when: f"x_Depth_{t // 1000}.000000"),
+    "ticks": (1e7, lambda t, when: f"{(t + 62135596800 * 10**9) // 100}"),
+    "ticks of Windows": (1e7, lambda t, when: f"{(t + 11644473600 * 10**9) // 100}"),
+    "date_us": (1e6, lambda t, when: when.strftime("%Y%m%d_%H%M%S_") + str(when.microsecond)),
+    "date-us": (1e6, lambda t, when: when.strftime("%Y-%m-%d-%H-%M-%S-%f")),
+    "date_ms": (1e3, lambda t, when: when.strftime("%Y%m%d_%H%M%S_") + str(when.microsecond // 1000)),
+    "date-ms": (1e3, lambda t, when: when.strftime("%Y-%m-%d_%H-%M-%S-") + f"{when.microsecond // 1000:03d}"),
+}
+
+
+@pytest.mark.parametrize("written", list(_WRITTEN))
+@given(moments=st.lists(st.integers(0, 10_000), min_size=12, max_size=40, unique=True), start=st.integers(0, 10**9 - 1))
+@settings(max_examples=40, deadline=None)
+def test_parts_of_a_second_are_told_from_all_names_together(written, moments, start):
+    resolution, write = _WRITTEN[written]
+    first = 1_700_000_000 * 10**9 + start
+    every = [first + moment * 2_345_678 for moment in [*moments, *range(10_001, 10_900, 3)]]  # some have all digits
+    epoch = datetime(1970, 1, 1, tzinfo=timezone.utc)
+    names = {t: write(t, epoch + timedelta(microseconds=t // 1000)) + ".ply" for t in every}
+    series = chosen(*sorted(names.values()))
+    assert list(series.names) == [names[t] for t in sorted(every)]
+    expected = (np.array(sorted(every)) - min(every)) / 1e9
+    np.testing.assert_allclose(series.times(), expected, atol=2 / resolution)
+
+
+@pytest.mark.parametrize(
+    "stem", ["20240305_143000_{}", "rec_2024-03-05_14-30-00_{}", "20240305_1430{1:02d}_{0}", "1700000000_{}"]
+)
+@pytest.mark.parametrize("form", ["{}", "{:04d}", "{:06d}"])
+def test_numbers_that_go_on_from_name_to_name_are_no_parts_of_a_second(stem, form):
+    names = [stem.format(form.format(k), k) + ".ply" for k in range(1, 25)]
+    series = chosen(*names)
+    assert list(series.names) == names
+    seconds = np.arange(24) if "{1" in stem else None
+    assert series.times() is None if seconds is None else np.array_equal(series.times(), seconds)
 
 
 def test_gaps_stay_gaps_in_time_and_are_named():

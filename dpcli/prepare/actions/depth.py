@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -51,7 +51,8 @@ DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of 
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
     r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
-    r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
+    r"|infra|thermal|reflect|ambient|uncertain|varianc|fisheye|skelet|temperature|active_?brightness"
+    r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
 _FOREIGN = tuple(  # that may hold depth, and are not read
@@ -152,7 +153,7 @@ class DepthVideos:
         kept, left_out = [], []
         for given in self.inputs:
             found = find_videos(given, self.pattern)
-            beside = pictures_beside_depth([path.relative_to(given) for path, _ in found])
+            beside = pictures_beside_depth({path.relative_to(given): series for path, series in found})
             left_out += [as_utf8(path.as_posix()) for path in sorted(beside)]
             kept += [(path, series, given) for path, series in found if path.relative_to(given) not in beside]
         return kept, left_out
@@ -291,22 +292,24 @@ def _tells_time(item: Item) -> bool:
     return series.times() is not None if series else stamped
 
 
-def pictures_beside_depth(paths: Sequence[Path]) -> set[Path]:
+def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:
     """Returns those of some relative paths that hold confidence, color, masks and the like: a part of the path says so, and
-    another one at its place says depth.
+    another one at its place says depth; or a folder at its place says depth and names its frames alike, one for one.
     """
     siblings: dict[Path, set[str]] = {}
-    for path in paths:
+    for path in videos:
         for part in (path, *path.parents):
             siblings.setdefault(part.parent, set()).add(part.stem)
     with_depth = {folder for folder, names in siblings.items() if any(says_depth(name) for name in names)}
+    frames = {(path.parent, series.stems) for path, series in videos.items() if series and says_depth(path.stem)}
     return {
         path
-        for path in paths
+        for path, series in videos.items()
         if any(
             part.parent in with_depth and _OTHER_PICTURES.search(part.stem) and not says_depth(part.stem)
             for part in (path, *path.parents)
         )
+        or (series and not says_depth(path.stem) and len(series.names) > 1 and (path.parent, series.stems) in frames)
     }
 
 

@@ -15,6 +15,13 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
+from dpcli.prepare.decode.calibration_texts import (
+    MATLAB_ADVICE,
+    mapping_of_bouguet,
+    mapping_of_ini,
+    mapping_of_xml,
+    without_matlab_counting,
+)
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.text_files import check_depth, parse_json
 
@@ -58,13 +65,16 @@ _EXPECTED = (
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Reads a calibration: JSON or YAML of RealSense, Open3D, ROS, OpenCV, Kalibr, ScanNet's 4x4 text, COLMAP's
-    ``cameras.txt``, ``key = value`` lines, or a matrix in ``.npy`` or text; row- or column-major.
+    """Reads a calibration: JSON or YAML of RealSense, Open3D, ROS, OpenCV (XML, too), Kalibr, MATLAB (``toStruct`` as JSON,
+    Bouguet's ``.m``), ScanNet's 4x4 text, COLMAP's ``cameras.txt``, ``key = value`` lines, or a matrix in ``.npy`` or text;
+    row- or column-major.
 
     Raises DataError that names what the file lacks, or declares and can't be used.
     """
     if path.suffix.lower() == ".npy":
         return _of_numbers(path, _load_npy(path))
+    if path.suffix.lower() == ".mat" and path.is_file():
+        raise DataError(f"{path}: {MATLAB_ADVICE}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -98,8 +108,13 @@ def camera_of_arrays(
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
+    data: Any
     if suffix in (".yaml", ".yml"):
         data = _yaml(path, text)
+    elif suffix == ".xml" or text.lstrip().startswith("<"):
+        data = mapping_of_xml(path, text)
+    elif suffix in (".ini", ".txt", ".m") and (told := mapping_of_ini(text) or mapping_of_bouguet(text)):
+        data = told
     elif suffix == ".json" or text.lstrip().startswith(("{", "[{")):
         data = parse_json(text, path)
     else:
@@ -249,7 +264,7 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
             f"{path}: is the raw calibration of an Azure Kinect, whose lens model is not read; {_EXPECTED}, as the"
             " camera's SDK reports them for the depth mode"
         )
-    data = _with_numbers(data)
+    data = without_matlab_counting(_with_numbers(data))
     own = _camera_of(path, data)
     if _are_numbers([own.get("skew", 0)]) and own.get("skew"):
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")

@@ -32,6 +32,10 @@ FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  # of two files of one frame
 # names that say depth, and not a picture of it or what lies beside it
 _DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
 _OTHERWISE = re.compile(r"disparit|(?<![a-z])disp(_?map)?(?![a-z])|(?<![a-z])inv(erse)?[-_ ]?depth", re.IGNORECASE)
+_INFRARED = re.compile(
+    r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
+    re.IGNORECASE,
+)
 _GRAY_NOISE, _COLORED_SHARE = (
     24,
     0.02,
@@ -357,7 +361,15 @@ def says_depth(name: str) -> bool:
 
 
 def require_depth(path: Path, name: str) -> None:
-    """Raises DataError where a video's name says that it holds disparities or the inverse of depth."""
+    """Raises DataError where a video's name says that it holds disparities or the inverse of depth, or the name of its own
+    folder or file that these are pictures of an infrared camera.
+    """
+    own = name.rpartition("/")[2]
+    if _INFRARED.search(own) and not says_depth(own):
+        raise DataError(
+            f"{path}: by its name it holds pictures of an infrared camera, not depth; give the folder of the depth, or call"
+            " this one otherwise if it is depth"
+        )
     said = _OTHERWISE.search(name)
     if said and (said[0].lower().startswith("inv") or not says_depth(name)):
         what = "the inverse of depth" if said[0].lower().startswith("inv") else "disparities"

@@ -1,4 +1,4 @@
-"""Decodes single ROS messages: points (PointCloud2), depth (Image, CompressedImage) and a camera (CameraInfo)."""
+"""Decodes single ROS messages: points (PointCloud2, Livox's CustomMsg), depth (Image, CompressedImage) and a camera (CameraInfo)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from dpcli.prepare.decode.calibration import lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
+from dpcli.prepare.recordings.livox import LIVOX_KINDS, LivoxScan
 
-CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)
+CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_KINDS)
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo",)
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -26,10 +27,12 @@ _DEPTH_HEADER = struct.Struct("<iff")  # before the PNG of image_transport's com
 
 
 def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cloud:
-    """Returns the points of a PointCloud2, with colors where it has them, and the fields ``keep`` beside.
+    """Returns the points of a PointCloud2 or of a Livox scan, with colors where it has them, and the fields ``keep`` beside.
 
     Raises DataError when it holds fewer bytes than it says, or no x, y, z.
     """
+    if isinstance(content, LivoxScan):
+        return cloud_of_columns(path, content.columns, keep)
     order = ">" if content.is_bigendian else "<"
     fields = {field.name: field for field in content.fields if field.datatype in _POINT_TYPES and field.count in (0, 1)}
     step, width, height = int(content.point_step), int(content.width), int(content.height)

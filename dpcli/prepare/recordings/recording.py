@@ -14,6 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -122,10 +123,15 @@ class Recording:
                 if found is None:
                     return
                 connection, logged, raw = found
-                content = self._reader.deserialize(raw, connection.msgtype) if self.read % stride == 0 else None
+                content = self._content(raw, connection.msgtype) if self.read % stride == 0 else None
             self.read += 1
             if content is not None:
                 yield Message(content, connection.msgtype, logged)
+
+    def _content(self, raw: bytes, kind: str) -> Any:
+        if kind in LIVOX_KINDS:
+            return read_livox(raw, ros1=not self._reader.is2)
+        return self._reader.deserialize(raw, kind)
 
 
 @contextmanager

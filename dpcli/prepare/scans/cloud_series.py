@@ -31,6 +31,7 @@ _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
     " .bag .mcap .db3 .active .bz2 .xz .zst".split()
 )
+_PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
 _ADVICE = {
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst"), "unpack them"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
@@ -58,11 +59,18 @@ def find_sequences(
             found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else ""
+        advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
     return _without_logs(
         root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses
     )
+
+
+def _of_pictures(root: Path) -> str:
+    """Returns what to do with the pictures or videos below a folder without clouds, "" where there are none."""
+    names = (name.lower() for _, _, files in walk_folders(root) for name in files if not is_hidden(name))
+    found = Counter(splitext(name)[1] for name in names if name.endswith(_PICTURES))
+    return f"; found {', '.join(_counted(found))}: if they hold depth, `dpc prepare depth` reads them" if found else ""
 
 
 def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[Series]:

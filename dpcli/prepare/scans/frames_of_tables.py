@@ -13,6 +13,7 @@ from dpcli.prepare.scans.times_of_tables import (
     SHORTEST,
     Clock,
     Table,
+    calendar_seconds,
     clock_seconds,
     seconds_and_parts,
     seconds_of,
@@ -125,6 +126,8 @@ def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | N
     else:
         values = moments
     _require_all(table, column, np.isfinite(values))
+    if moments is None and (told := calendar_seconds(column, values)) is not None:
+        values = moments = told
     if moments is None and len(values) and np.abs(values).max() >= _EXACT:
         values = _exact(table.words(place), values)
     return values, values, moments is not None

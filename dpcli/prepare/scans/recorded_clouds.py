@@ -20,7 +20,7 @@ from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.store.schema import KEPT
 
-_WANTED = "clouds (PointCloud2)"
+_WANTED = "clouds (PointCloud2, or CustomMsg of Livox)"
 _LISTED = 8
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import words_of
+from dpcli.runtime.clips.name_numbers import is_ticks
 
 _UNITS = (
     (1.0, "s sec secs second seconds"),
@@ -21,21 +22,36 @@ _UNITS = (
     (1e-9, "ns nsec nsecs nano nanos nanosec nanosecs nanosecond nanoseconds"),
     (60.0, "minute minutes"),
     (3600.0, "hour hours hr hrs"),
+    (86_400.0, "days"),
 )
 _SECONDS = {word: size for size, words in _UNITS for word in words.split()}
-_IN_BRACKETS = {"min": 60.0, "mins": 60.0, "h": 3600.0}  # which mean something else without
+_IN_BRACKETS = {
+    "min": 60.0,
+    "mins": 60.0,
+    "h": 3600.0,
+    "d": 86_400.0,
+    "day": 86_400.0,
+}  # which mean something else without
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 SHORTEST = 1e-4  # seconds between frames: what is shorter are days, or times of points
 _LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
-_TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
+_TIME_WORDS = frozenset(
+    "time timestamp stamp t timestamps epoch utc ts datetime date posix zeit zeitstempel uhrzeit datum heure hora fecha".split()
+)
 _NO_UNITS = _TIME_WORDS | {"gps", "unix", "posix", "local", "sensor", "since", "start"}
+_SEVERAL = re.compile(r"[\[(]\s*([\d.]+)\s*([^\W\d]+)\s*[\])]\s*$")  # such as [100 ns]
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?\s*$")
 _CLOCK = re.compile(
     r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(\d+) days?,? )?"  # a date, or a number of days
     r"(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(?:([AP])\.?M\.?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
+_DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # with points the day stands first
 _DAY = 86_400.0
+_TICK = 1e-7
+_DAYS = ((36_526, 54_788), (730_486, 748_749))  # 2000 to 2050 as spreadsheets and as MATLAB count days
+_FASTEST = 0.002  # seconds between frames: smaller steps of such numbers are days
+_BEYOND = 5  # steps that may be missing where a minute ends; as many would lie between its 60th and 100th second
 
 
 class Table(Protocol):
@@ -77,6 +93,9 @@ def seconds_of(column: str, values: np.ndarray) -> float:
     (0.0, 1e-06)
     """
     words = words_of(column)
+    if several := _SEVERAL.search(column):
+        size, unit = several[1], " ".join(words_of(several[2]))
+        return float(size) * _SECONDS.get(unit, 0.0) if re.fullmatch(r"\d+(\.\d+)?", size) else 0.0
     if len(words) > 1 and words[-1] in _SECONDS:
         return _SECONDS[words[-1]]
     if set(words) & _TIME_WORDS and (inside := _BRACKETS.search(column)):
@@ -85,11 +104,59 @@ def seconds_of(column: str, values: np.ndarray) -> float:
             return _IN_BRACKETS.get(" ".join(told), 0.0)
     digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
     epoch = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 else 0.0
+    epoch = _TICK if epoch and all(is_ticks(int(value)) for value in values[[0, -1]]) else epoch
     if not (values == np.floor(values)).all():
         return epoch or 1.0  # milliseconds since 1970 may have fractions
     unit = epoch if set(words) & _TIME_WORDS else 0.0
     steps = np.diff(np.unique(values)) if unit else values[:0]
     return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
+
+
+def calendar_seconds(column: str, values: np.ndarray) -> np.ndarray | None:
+    """Returns the seconds f64 (N) of a column of times whose numbers f64 (N) are written as digits of dates (20240305143057.25),
+    as hours, minutes and seconds (143057.25), or as days (of spreadsheets, of MATLAB); None where they are nothing of these.
+
+    >>> calendar_seconds("utc", np.array([143059.5, 143100.0])) is None  # two frames are too few to tell
+    True
+    >>> calendar_seconds("time", np.array([20240305143059.5, 20240305143100.0])).tolist()
+    [1709649059.5, 1709649060.0]
+    """
+    words = set(words_of(column))
+    if not words & _TIME_WORDS or not words <= _NO_UNITS or not len(values) or not np.isfinite(values).all():
+        return None
+    least, most = float(values.min()), float(values.max())
+    if 1.9e13 < least <= most < 2.1e13:
+        return _of_digits(values)
+    if 1.9e16 < least <= most < 2.1e16:
+        return _of_digits(values / 1000)
+    steps = np.diff(np.unique(values))
+    step = float(np.median(steps)) if len(steps) else 0.0
+    fractions = bool((values != np.floor(values)).any())
+    if fractions and 0 < step < _FASTEST and any(first <= least <= most < last for first, last in _DAYS):
+        return values * _DAY
+    if most < 240_000 and 0 < step * _BEYOND < 40 and (values % 100 < 60).all() and (values % 10_000 < 6000).all():
+        seconds = values // 10_000 * 3600 + values % 10_000 // 100 * 60 + values % 100
+        over = np.diff(np.unique(values // 100)) > 0
+        jumps, told = steps[steps >= 40], np.diff(np.unique(seconds))[steps >= 40]
+        return seconds if over.any() and len(jumps) == len(over) and (told <= _BEYOND * step).all() else None
+    return None
+
+
+def _of_digits(values: np.ndarray) -> np.ndarray | None:
+    """Returns the seconds since 1970, f64 (N), of numbers whose digits are year, month, day, hour, minute and second."""
+    days = {}
+    for day in np.unique(values // 1_000_000).astype(np.int64).tolist():
+        try:
+            moment = datetime(day // 10_000, day // 100 % 100, day % 100, tzinfo=timezone.utc)
+        except ValueError:
+            return None
+        days[day] = moment.timestamp()
+    clock = values % 1_000_000
+    if not ((clock < 240_000) & (clock % 10_000 < 6000) & (clock % 100 < 60)).all():
+        return None
+    known = np.array(list(days))
+    start = np.array(list(days.values()))[np.searchsorted(known, values // 1_000_000)]
+    return start + clock // 10_000 * 3600 + clock % 10_000 // 100 * 60 + clock % 100
 
 
 def unit_by_rate(column: str, values: np.ndarray, fps: float) -> float:
@@ -146,8 +213,9 @@ def _one_column(table: Table, name: str) -> Clock | None:
         except DataError:
             seconds = np.array(clock_seconds(table.words(place)))
         else:
-            unit = seconds_of(name, values) if len(values) and np.isfinite(values).all() else 0.0
-            seconds = (values - values[0]) * unit if unit else values[:0]
+            told = calendar_seconds(name, values)
+            unit = seconds_of(name, values) if told is None and len(values) and np.isfinite(values).all() else 0.0
+            seconds = told if told is not None else (values - values[0]) * unit if unit else values[:0]
     return Clock((name,), seconds) if len(seconds) and np.isfinite(seconds).all() else None
 
 
@@ -156,13 +224,15 @@ def clock_seconds(words: Sequence[str]) -> list[float]:
 
     >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["1 days 00:00:01"]), clock_seconds(["a"])
     ([86399.5, 86400.0], [86401.0], [])
+    >>> clock_seconds(["31.12.2023 23:59:59", "01.01.2024 00:00:01"])
+    [1704067199.0, 1704067201.0]
     >>> clock_seconds(["11:59:59 AM", "12:00:01 PM", "1:00:00 PM"])
     [43199.0, 43201.0, 46800.0]
     """
     found: list[float] = []
     days = 0
     for word in words:
-        match = _CLOCK.fullmatch(word.strip())
+        match = _CLOCK.fullmatch(_DAY_FIRST.sub(r"\3-\2-\1", word.strip()))
         try:
             seconds = _seconds_told(match) if match else None
         except ValueError:  # such as a month 13

@@ -18,7 +18,7 @@ import numpy as np
 from dpcli.runtime.progress import log
 
 _DATE = re.compile(
-    r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
+    r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:([.,_-])(\d{1,9})(?!\d))?"
     r"(?:\+([01]\d):?([0-5]\d)(?!\d))?"  # ahead of Greenwich; behind a minus other numbers may stand
 )
 _YEAR_LAST = re.compile(
@@ -27,7 +27,9 @@ _YEAR_LAST = re.compile(
 _SECONDS = re.compile(
     r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|[1-9]\d{6,7}|\d{9}))(?!\d)"
 )  # since 1970, and their parts
+_PARTED = re.compile(r"(?<!\d)([12]\d{9})([_-])(\d{1,9})(?!\d)")  # the same, of any length
 _MICROSECONDS, _NANOSECONDS = 6, 9  # digits of the parts
+_TICK_PLACES = 7
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _HALF_DAY = re.compile(r"\d[.:_-]\d\d[ _.-]?[ap]\.?m(?![a-z])", re.IGNORECASE)  # a time before or after noon
 _TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:h])([0-5]\d)\2([0-5]\d)(?!\d)")
@@ -57,9 +59,62 @@ class Name:
         return "*".join(self.parts).casefold()
 
 
+def is_ticks(number: int) -> bool:
+    """Returns whether a number counts tenths of microseconds since the year 1 (.NET) or 1601 (Windows), and means a moment
+    from 2000 to 2050.
+
+    >>> is_ticks(638452458000000000), is_ticks(133531434000000000), is_ticks(1700000000000000000)
+    (True, True, False)
+    """
+    return 630 <= number // 10**15 <= 646 or 126 <= number // 10**15 <= 141
+
+
+def parse_names(texts: Sequence[str]) -> list[Name]:
+    """Returns the names of one folder taken apart, because one alone doesn't tell what its parts of a second are.
+
+    Behind seconds or dates, digits of several lengths lack leading zeros: they count milli-, micro- or nanoseconds by
+    the longest. Numbers that go on by 1 from name to name count frames.
+
+    >>> [name.numbers for name in parse_names(["1700000000_5.png", "1700000000_120000000.png"])]
+    [('1700000000.000000005',), ('1700000000.120000000',)]
+    """
+    places = _places(texts)
+    return [parse_name(text, places) for text in texts]
+
+
+def _places(texts: Sequence[str]) -> int | None:
+    """Returns how many digits the parts of a second have in names of one folder; 0: what looks like parts counts frames;
+    None: as they are written.
+    """
+    found = []
+    for text in texts:
+        stem = splitext(text)[0]
+        match = _PARTED.search(stem)
+        if match is None and (date := _DATE.search(stem)) and date[7] in ("_", "-"):
+            match = date
+        if match:
+            groups = match.groups()
+            whole, own = (groups[0], groups[2]) if match.re is _PARTED else ("".join(map(str, groups[:6])), groups[7])
+            found.append((int(whole), int(own), len(own), match.re is _PARTED))
+    if len(found) < 2:
+        return None
+    found.sort()
+    lengths = {length for _, _, length, _ in found}
+    if all(b[1] - a[1] == 1 for a, b in zip(found, found[1:])):
+        return 0
+    within = [b[1] - a[1] for a, b in zip(found, found[1:]) if a[0] == b[0]]
+    if (within and set(within) == {1}) or len({joined for *_, joined in found}) > 1:
+        return None  # frames of several recordings
+    longest = max(lengths)
+    falls = any(b[1] < a[1] for a, b in zip(found, found[1:]))
+    if len(lengths) == 1 and not (falls and longest in (3, _NANOSECONDS)):
+        return None
+    return 3 if longest <= 3 else _MICROSECONDS if longest <= _MICROSECONDS else _NANOSECONDS
+
+
 @lru_cache(maxsize=1 << 16)  # a name is asked for its order, its number and its time
-def parse_name(text: str) -> Name:
-    """Returns a file's name taken apart.
+def parse_name(text: str, places: int | None = None) -> Name:
+    """Returns a file's name taken apart. places: digits of the parts of a second, as `parse_names` finds them.
 
     >>> parse_name("frame-000012.depth.png").shape, parse_name("scan_3.25.ply").numbers
     ('frame-*.depth', ('3.25',))
@@ -67,7 +122,7 @@ def parse_name(text: str) -> Name:
     stem, suffix = splitext(text)
     parts, numbers, is_time, end = [], [], [], 0
     while end < len(stem):
-        match, written, timed = _next_number(stem, end)
+        match, written, timed = _next_number(stem, end, places)
         if match is None:
             break
         parts.append(stem[end : match.start()])
@@ -77,24 +132,40 @@ def parse_name(text: str) -> Name:
     return Name(text, (*parts, stem[end:]), suffix.lower(), tuple(numbers), tuple(is_time))
 
 
-def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool]:
+def _next_number(stem: str, start: int, places: int | None) -> tuple[re.Match[str] | None, str, bool]:
     """Returns the first number from ``start`` on, how it is written as one, and whether it is a date or seconds and parts."""
     plain = _NUMBER.search(stem, start)
     if plain is None:
         return None, "", False
     digits = len(plain[0])
-    if digits >= 4 and (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(*date.groups())):
-        return date, seconds, True
+    if digits >= 4 and (date := _DATE.match(stem, plain.start())):
+        *moment, sign, own, hours, minutes = date.groups()
+        seconds = _since_1970(*moment, _filled(own, places) if sign in ("_", "-") else own, hours, minutes)
+        if (
+            seconds
+            and sign in ("_", "-")
+            and (places == 0 or (sign == "-" and places is None and len(own) < _MICROSECONDS))
+        ):
+            end = date.start(7)
+            return _DATE.match(stem[:end], plain.start()), _since_1970(*moment, None), True
+        if seconds:
+            return date, seconds, True
     if (
         digits in (2, 5)
         and (date := _YEAR_LAST.match(stem, plain.start()))
         and (seconds := _since_1970_told_last(date))
     ):
         return date, seconds, True
-    if digits >= 10 and (parts := _SECONDS.match(stem, plain.start())):
+    if digits >= 10 and places and (parts := _PARTED.match(stem, plain.start())):
+        return parts, f"{parts[1]}.{_filled(parts[3], places)}", True
+    if digits >= 10 and (parts := _SECONDS.match(stem, plain.start())) and (places is None or parts[2]):
         own = parts[2] or parts[3]
         return parts, f"{parts[1]}.{own if parts[2] or len(own) == _MICROSECONDS else own.zfill(_NANOSECONDS)}", True
     return plain, plain[0], False
+
+
+def _filled(own: str | None, places: int | None) -> str | None:
+    return own.zfill(places) if own and places else own
 
 
 def _since_1970_told_last(match: re.Match[str]) -> str:
@@ -178,11 +249,14 @@ class NumberColumns:
         numbers = self.columns[column]
         if all(name.is_time[column] for name in self.names):
             return [_in_seconds(number, self.counted[column]) for number in numbers]
+        lengths = {len(number.partition(".")[0]) for number in numbers}
+        for digits, places in _EPOCHS:
+            fits = lengths == {digits} and all(number[0] in "12" or digits == 18 for number in numbers)
+            if fits and (places or not any("." in number for number in numbers)):  # milliseconds may have fractions
+                ticks = digits == 18 and all(is_ticks(int(Decimal(number))) for number in numbers)
+                return [Decimal(number).scaleb(-_TICK_PLACES if ticks else -places) for number in numbers]
         if all("." in number and len(number.partition(".")[2]) >= 6 for number in numbers):  # as %f and ROS write them
             return [_in_seconds(number, False) for number in numbers]
-        for digits, places in _EPOCHS:
-            if all(len(number) == digits and (number[0] in "12" or digits == 18) for number in numbers):
-                return [Decimal(number).scaleb(-places) for number in numbers]
         return None
 
 
@@ -191,7 +265,7 @@ def in_order(paths: Sequence[Path]) -> list[Path]:
 
     Where most have a name of their own shape they stay in the order in which they come.
     """
-    names = [parse_name(path.name) for path in paths]
+    names = parse_names([path.name for path in paths])
     (shape, count), *_ = Counter(name.shape for name in names).most_common(1) or [("", 0)]
     if count <= len(paths) // 2:
         return list(paths)
@@ -199,7 +273,8 @@ def in_order(paths: Sequence[Path]) -> list[Path]:
     alike = [path for path, name in zip(paths, names) if name.shape == shape]
     tell_unclear_order(alike[0].parent, [path.name for path in alike])
     others = [path for path, name in zip(paths, names) if name.shape != shape]
-    return sorted(alike, key=lambda path: columns.key(parse_name(path.name))) + others
+    ordered = sorted(zip(alike, columns.names), key=lambda pair: columns.key(pair[1]))
+    return [path for path, _ in ordered] + others
 
 
 def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
@@ -210,6 +285,8 @@ def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
         why = f"whether day or month stands first in {dates[0][0]} and the like"
     elif len(names) > 1 and any(map(_HALF_DAY.search, names)):
         why = "when it was by clocks of 12 hours"
+    elif _may_lack_zeros(names):
+        why = "whether the digits behind the point count nanoseconds without leading zeros"
     elif _may_pass_midnight(names):
         why = "whether these times of day go on past midnight"
     if why:
@@ -218,6 +295,15 @@ def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
                 f"{folder}: {why} can't be told from the names; the numbers order them as they stand. Names such as"
                 " 2024-03-05_14-30-00 tell it"
             )
+
+
+def _may_lack_zeros(names: Sequence[str]) -> bool:
+    """Returns whether seconds have up to nine digits behind the point, and neither a zero before nor one at the end of
+    some of these tells fractions cut short from nanoseconds without leading zeros.
+    """
+    after = [match[2] for name in names if (match := _SECONDS.search(name)) and match[2]]
+    lengths = {len(digits) for digits in after}
+    return len(lengths) > 1 and max(lengths) == _NANOSECONDS and not any(d[0] == "0" or d[-1] == "0" for d in after)
 
 
 def _may_pass_midnight(names: Sequence[str]) -> bool:

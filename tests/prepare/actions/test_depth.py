@@ -181,6 +181,24 @@ def test_classes_that_are_hardly_meant_are_told(tmp_path, capsys, labels, said):
     assert said in err and bool(said) == bool(err)
 
 
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["data/wave/a", "data/push/b"], "one class, 'data'; if its folders are the classes (push, wave)"),
+        (["anna/wave/1", "anna/push/1", "ben/wave/1", "ben/push/1"], "the classes are anna, ben; the folders below"),
+        (["Wave/a", "wave/b"], "Wave and wave are different classes"),
+        (["wave/a", "push/a"], ""),
+        (["wave/a/depth", "push/a/depth"], ""),
+        (["wave/anna/1", "wave/ben/1", "push/anna/1"], ""),
+        (["wave/train/1", "wave/test/1", "push/train/1", "push/test/1"], ""),
+    ],
+)
+def test_folders_that_are_hardly_the_classes_are_told(tmp_path, capsys, names, said):
+    labels_of_folders(tmp_path, names, "CLASS/VIDEO")
+    err = capsys.readouterr().err
+    assert said in " ".join(err.split()) if said else not err
+
+
 def test_labels_that_a_program_wrote_as_fractions_are_whole(tmp_path):
     (tmp_path / "labels.csv").write_text("name,label\na,10.0\nb,2.0\n")
     table = read_labels(tmp_path / "labels.csv")

@@ -226,3 +226,36 @@ def test_folders_of_other_names_stay(tmp_path):
         write(tmp_path / "in" / name, **{"0": depth(1000)})
     write(tmp_path / "other" / "image_browsing", **{"0": depth(1000)})
     assert len(DepthVideos(inputs=(tmp_path / "in", tmp_path / "other")).items()) == 4
+
+
+@pytest.mark.parametrize("beside", ["ir", "thermal", "ab", "nir", "left", "camera2", "reflectivity", "body_index", "x"])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_folder_of_the_same_frames_beside_depth_is_no_other_video(tmp_path, beside, kind):
+    for name, first in (("depth", 1000), (beside, 50)):
+        write(
+            tmp_path / "v" / name,
+            **{f"{t:03d}": depth(first + t).astype(kind if first < 99 else np.uint16) for t in (0, 1)},
+        )
+    reader, sequence = read(tmp_path / "v")
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert any(beside in line and "left out" in line for line in reader.summary(reader.items()))
+
+
+def test_folders_of_people_beside_one_another_stay_videos_whatever_their_frames_are_called(tmp_path):
+    for name in ("left", "right", "anna"):
+        write(tmp_path / "v" / name, **{f"{t:03d}": depth(1000 + t) for t in (0, 1)})
+    assert len(DepthVideos(inputs=(tmp_path / "v",)).items()) == 3
+
+
+@pytest.mark.parametrize("name", ["ir", "IR", "cam_ir", "infra1", "Infrared", "thermal", "abimage"])
+def test_pictures_of_an_infrared_camera_alone_are_refused_by_their_name(tmp_path, name):
+    folder = write(tmp_path / "v" / name, **{f"{t:03d}": depth(1000 + t) for t in (0, 1)})
+    for given in (folder, tmp_path / "v"):
+        with pytest.raises(DataError, match="infrared camera, not depth; give the folder of the depth"):
+            read(given)
+
+
+@pytest.mark.parametrize("name", ["ir_depth", "air", "first", "stir", "mirror"])
+def test_names_that_only_hold_these_letters_are_read(tmp_path, name):
+    folder = write(tmp_path / "v" / name, **{f"{t:03d}": depth(1000 + t) for t in (0, 1)})
+    assert first_depths(read(folder)[1]) == [1.0, 1.001]

@@ -355,3 +355,65 @@ def test_a_file_that_is_missing_or_no_text(tmp_path):
     for name, message in (("none.json", "cannot be read"), ("k.json", "is no text")):
         with pytest.raises(DataError, match=message):
             read_calibration(tmp_path / name)
+
+
+MATLAB = {"ImageSize": [480, 640], "RadialDistortion": [0, 0], "TangentialDistortion": [0, 0], "Skew": 0}
+OF_ONE = [[FX, 0, CX + 1], [0, FY, CY + 1], [0, 0, 1]]  # as MATLAB counts pixels
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.json", json.dumps(MATLAB | {"K": OF_ONE})),
+        ("c.json", json.dumps(MATLAB | {"IntrinsicMatrix": np.transpose(OF_ONE).tolist()})),
+        ("c.json", json.dumps(MATLAB | {"FocalLength": [FX, FY], "PrincipalPoint": [CX + 1, CY + 1]})),
+        ("Calib_Results.m", f"% of Bouguet's toolbox\nfc = [ {FX} ; {FY} ];\ncc = [ {CX} ; {CY} ];\nalpha_c = 0.0;\n"
+         "kc = [ 0 ; 0 ; 0 ; 0 ; 0 ];\nfc_error = [ 1 ; 1 ];\nnx = 640;\nny = 480;\n"),
+        ("ost.ini", f"# oST version 5.0 parameters\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[narrow_stereo]\n\ncamera matrix\n"
+         f"{FX} 0.0 {CX}\n0.0 {FY} {CY}\n0.0 0.0 1.0\n\ndistortion\n0.0 0.0 0.0 0.0 0.0\n"),
+    ],
+)  # fmt: skip
+def test_calibrations_of_matlab_and_of_ros_as_ini(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    found = read_calibration(tmp_path / name)
+    assert (found.width, found.height) == (640, 480)
+    for side in ("fx", "fy", "cx", "cy"):
+        assert getattr(found.intrinsics, side) == pytest.approx(getattr(CAMERA, side))
+
+
+@pytest.mark.parametrize("matrix", ["camera_matrix", "cameraMatrix", "Camera_Matrix", "K"])
+@pytest.mark.parametrize("suffix", ["xml", "yml", "json"])
+def test_every_form_of_opencvs_storage_tells_the_same(tmp_path, matrix, suffix):
+    path = tmp_path / f"c.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Tue Mar  5 14:30:00 2024")
+    storage.write(matrix, np.array(NESTED))
+    storage.write("distortion_coefficients", np.array([[0.1, -0.2, 0.001, 0.002, 0.03]]))
+    for side, pixels in (("image_width", 640), ("image_height", 480)):
+        storage.write(side, pixels)
+    storage.release()
+    found = read_calibration(path)
+    assert (found.intrinsics.fx, found.intrinsics.cy, found.width, found.height) == (FX, CY, 640, 480)
+    assert found.intrinsics.distortion == pytest.approx((0.1, -0.2, 0.001, 0.002, 0.03))
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("<opencv_storage><a></opencv_storage>", "is not XML"),
+        ("<calibration><fx>1</fx></calibration>", "expected <opencv_storage>"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "declares entities"),
+        ("<opencv_storage>" + "<a>" * 50_000 + "</a>" * 50_000 + "</opencv_storage>", "expected"),
+        ("<opencv_storage><K><data>a b c</data></K></opencv_storage>", "matrix"),
+    ],
+)
+def test_other_xml_is_refused_by_what_it_is(tmp_path, text, why):
+    (tmp_path / "c.xml").write_text(text)
+    with pytest.raises(DataError, match=why):
+        read_calibration(tmp_path / "c.xml")
+
+
+def test_matlabs_own_files_are_refused_with_what_to_do(tmp_path):
+    (tmp_path / "c.mat").write_bytes(b"MATLAB 5.0 MAT-file")
+    with pytest.raises(DataError, match="writematrix"):
+        read_calibration(tmp_path / "c.mat")

@@ -11,6 +11,7 @@ import pytest
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.scans.cloud_series import find_sequences
 from dpcli.prepare.scans.clouds import CloudFolders
 
 RNG = np.random.default_rng(0)
@@ -343,3 +344,11 @@ def test_columns_that_are_not_read_are_named(tmp_path):
     np.save(tmp_path / "0.npy", np.ones((4, 6)))
     reader = CloudFolders(tmp_path, pattern="*.npy")
     assert reader.summary(reader.items())[0] == "1 sequence of 1 frames found; not read: columns 4 to 6 (no names)"
+
+
+def test_pictures_of_depth_are_sent_to_the_command_that_reads_them(tmp_path):
+    (tmp_path / "v").mkdir()
+    for k in range(3):
+        (tmp_path / "v" / f"{k}.png").write_bytes(b"\x89PNG")
+    with pytest.raises(DataError, match="found 3 .png files: if they hold depth, `dpc prepare depth` reads them"):
+        find_sequences(tmp_path, (".ply",))

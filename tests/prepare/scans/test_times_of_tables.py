@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
+
 import numpy as np
 import pytest
 
@@ -41,7 +43,21 @@ def csv(path, header, rows):
         ("t", [0.5, 50.5], [0, 50]),
         ("time", ["0 days 00:00:01.500000", "0 days 00:00:01.750000"], [0, 0.25]),
         ("time", ["11:59:59 AM", "12:00:00.5 pm"], [0, 1.5]),
-        ("time", [45356.5, 45356.500001157], None),  # days, as spreadsheets count them
+        ("time", [45356.5, 45356.50001157407], [0, 1]),  # days, as spreadsheets count them
+        ("time", [45356.5, 45356.75], [0, 0.25]),
+        ("time [days]", [0.5, 0.75], [0, 21_600]),
+        ("time [100 ns]", [0, 1_000_000], [0, 0.1]),
+        ("time [0.1 ms]", [0, 1_000], [0, 0.1]),
+        ("Zeitstempel", ["05.03.2024 23:59:59,5", "06.03.2024 00:00:00"], [0, 0.5]),
+        ("datetime", ["2024-03-05 14:30:00", "2024-03-05 14:30:01"], [0, 1]),
+        ("date", ["2024-03-05", "2024-03-06"], None),
+        ("time [5 turns]", [0.5, 0.75], None),
+        ("timestamp", [638_452_458_000_000_000, 638_452_458_001_000_000], [0, 0.1]),  # .NET
+        ("timestamp", [133_531_434_000_000_000, 133_531_434_001_000_000], [0, 0.1]),  # Windows
+        ("timestamp", [315_966_265_259_836_000, 315_966_265_359_836_000], [0, 0.1]),  # nanoseconds
+        ("timestamp", [20240305143059.5, 20240305143100.25], [0, 0.75]),
+        ("timestamp", [20231231235959, 20240101000001], [0, 2]),
+        ("timestamp", [20249905143059.5, 20249905143100.25], [0, 40.75]),  # no date has a month 99
         ("time", ["1 day, 0:00:01", "2 days, 0:00:01"], [0, 86400]),
     ],
 )
@@ -53,7 +69,7 @@ def test_units_in_the_names_of_times(tmp_path, name, values, expected):
     if expected is None:
         assert sequence.time is None and name in about.split("not read: ")[1]
     else:
-        np.testing.assert_allclose(sequence.time, expected, atol=1e-6)
+        np.testing.assert_allclose(sequence.time, expected, atol=2e-5)  # of ticks a float holds every 16th
 
 
 @pytest.mark.parametrize(
@@ -70,10 +86,30 @@ def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values,
     np.testing.assert_allclose(only_sequence(path, frame_column=name, fps=fps)[0].time, expected, atol=1e-6)
 
 
-def test_a_column_of_days_numbers_frames_by_their_rate(tmp_path):
-    path = csv(tmp_path / "a.csv", "time,x,y,z", [(45356.5 + k * 1.157e-5, k, 1, 2) for k in range(3)])
-    assert only_sequence(path, frame_column="time")[0].time is None
-    np.testing.assert_allclose(only_sequence(path, frame_column="time", fps=10)[0].time, [0, 0.1, 0.2])
+@pytest.mark.parametrize("rate", [1, 4, 10, 25])
+@pytest.mark.parametrize("written", ["spreadsheet", "matlab", "clock", "digits", "milliseconds"])
+@pytest.mark.parametrize("as_frames", [False, True])
+def test_moments_written_as_days_or_as_digits_are_seconds(tmp_path, rate, written, as_frames):
+    moments = [datetime(2024, 3, 5, 14, 59, 50) + timedelta(seconds=k / rate) for k in range(20 * rate)]
+    days = [(moment - datetime(1899, 12, 30)) / timedelta(days=1) for moment in moments]
+    values = {
+        "spreadsheet": [f"{day:.11f}" for day in days],
+        "matlab": [f"{day + 693_960:.11f}" for day in days],
+        "clock": [moment.strftime("%H%M%S.") + f"{moment.microsecond // 1000:03d}" for moment in moments],
+        "digits": [moment.strftime("%Y%m%d%H%M%S.") + f"{moment.microsecond // 1000:03d}" for moment in moments],
+        "milliseconds": [moment.strftime("%Y%m%d%H%M%S") + f"{moment.microsecond // 1000:03d}" for moment in moments],
+    }[written]
+    path = csv(tmp_path / "a.csv", "frame,utc,x,y,z", [(k, value, k, 1, 2) for k, value in enumerate(values)])
+    sequence, _ = only_sequence(path, frame_column="utc" if as_frames else "frame")
+    np.testing.assert_allclose(sequence.time, np.arange(len(values)) / rate, atol=5e-3)
+
+
+def test_plain_seconds_stay_seconds(tmp_path):
+    for start in (0, 50, 45_000, 735_000, 143_050):
+        times = start + np.arange(500) * 0.25
+        rows = [(k, time, k, 1, 2) for k, time in enumerate(times)]
+        sequence, _ = only_sequence(csv(tmp_path / f"{start}.csv", "frame,time,x,y,z", rows))
+        np.testing.assert_allclose(sequence.time, times - start, atol=1e-6)
 
 
 @pytest.mark.parametrize(
