@@ -64,7 +64,7 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
 def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
     done = dpc(
-        "generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(60, 60), "--picture", tmp_path / "sheet.png"
+        "generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(100, 60), "--picture", tmp_path / "sheet.png"
     )
     assert done.returncode == 0, done.stderr
     result = read_scene(scene)
@@ -75,7 +75,7 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
-    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(60, 60))
+    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(100, 60))
     assert same.returncode == 0 and "already complete" in same.stderr.decode()
     again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
     assert again.returncode == 2 and "--force" in again.stderr.decode()
