@@ -64,7 +64,16 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
 def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
     done = dpc(
-        "generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(100, 60), "--picture", tmp_path / "sheet.png"
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        *steps(100, 60),
+        "--picture",
+        tmp_path / "sheet.png",
     )
     assert done.returncode == 0, done.stderr
     result = read_scene(scene)
