@@ -48,11 +48,12 @@ class Search:
         """Returns the explanation after growth with motions of its bodies' patches, as long as the energy falls."""
         first = self.pool
         for _ in range(self.settings.regrow):
-            self.pool = [*first, *found.bodies, *split_bodies(self.frames, found)]
-            better = self._regrow(self._prune(self._grow(found)))
+            self.pool = split_bodies(self.frames, found)
+            better = self._prune(self._grow(found))
             if better.energy > found.energy - _SPLIT_GAIN:
                 break
-            found = better
+            self.pool = [*first, *found.bodies, *self.pool]
+            found = self._regrow(better)
         self.pool = first
         return found
 

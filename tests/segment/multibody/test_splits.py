@@ -49,7 +49,7 @@ def test_a_patch_of_a_body_gets_the_motion_of_its_part():
         ).mean()
         for body in split_bodies(frames, one)
     ]
-    assert min(gaps) < 0.7 * frames.spacing
+    assert min(gaps) < 1.5 * frames.spacing  # which fits to the part's points reach; it begins 13 spacings away
 
 
 def test_the_search_finds_a_part_whose_motion_nobody_proposed():
