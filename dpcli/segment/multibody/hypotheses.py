@@ -16,7 +16,7 @@ _STEPS, _WIDE = 12, 0.06  # of the ICP that carries a body on
 _FEWEST = 8  # points of a body
 _ALIKE = 0.7  # spacings that two trajectories differ at most to be one
 _MOST = 64  # hypotheses that are compared on all points
-_SEARCH = BodySearch(second_looks=0, polish=(0.5,))
+_SEARCH = BodySearch(second_looks=0, polish=(0.5,), gain=0.01)  # all frames judge small bodies later
 
 PairMotions = dict[tuple[int, int], np.ndarray]  # (t, u) -> motions (K,3,4)
 

@@ -1,4 +1,4 @@
-"""The search for the bodies of a sequence: greedy growth by what a body explains, pruning, refits, and growth anew."""
+"""The search for the bodies of a sequence: greedy growth by what a body explains, pruning, growth anew, splits, and refits."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.multibody.splits import split_bodies
 
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
+_SPLIT_GAIN = 1e-4  # of the energy, for which a round of splits is kept
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
@@ -32,7 +34,7 @@ class Search:
         self.pool = [body_of(frames, one.trajectory) for one in hypotheses]
 
     def run(self) -> Explanation:
-        """Returns the explanation: grown, pruned, grown anew without each body, and its motions tightened."""
+        """Returns the explanation: grown, pruned, grown anew without each body, split, and its motions tightened."""
         found = self._grow(self._first())
         found = self._prune(found)
         for _ in range(self.settings.regrow):
@@ -40,7 +42,20 @@ class Search:
             if better is found:
                 break
             found = better
-        return self._tighten(found)
+        return self._tighten(self._split(found))
+
+    def _split(self, found: Explanation) -> Explanation:
+        """Returns the explanation after growth with motions of its bodies' patches, as long as the energy falls."""
+        first = self.pool
+        for _ in range(self.settings.regrow):
+            self.pool = split_bodies(self.frames, found)
+            better = self._prune(self._grow(found))
+            if better.energy > found.energy - _SPLIT_GAIN:
+                break
+            self.pool = [*first, *found.bodies, *self.pool]
+            found = self._regrow(better)
+        self.pool = first
+        return found
 
     def judged_anew(self, found: Explanation) -> Explanation:
         """Returns the explanation with labels by its bodies' motions as they now are, and without needless bodies."""

@@ -33,7 +33,10 @@ class MultibodySettings:
         0.02, "multibody: how far points bend away from rigid motion where tracks are given, diameters.", above=0
     )
     regrow: int = setting(
-        2, "multibody: rounds in which each body in turn is taken out and its points are explained anew.", least=0
+        2,
+        "multibody: rounds in which each body in turn is taken out and its points are explained anew; then as many "
+        "with bodies split.",
+        least=0,
     )
 
     def __post_init__(self) -> None:
