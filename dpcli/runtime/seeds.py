@@ -21,7 +21,8 @@ class PrepareStream(IntEnum):
     SPLIT = 5005  # which samples go to which split; key: the stratum
     OBJECT_SPLIT = 1 << 28  # which objects go to which split
     OBJECT_STUDY = 1 << 29  # poses in which an object is looked at, to find joints that move nothing
-    SHAPE_PICTURES = 1 << 27  # pictures that a shape prior learns from; key: the round
+    SHAPE_PICTURES = 1 << 27  # models that a shape prior learns from, in their poses; key: the round
+    SHAPE_VIEWS = SHAPE_PICTURES + 1  # how they are drawn; key: the round
     MADE = 1 << 30  # a made subject (gestures) or object (articulated); key: its number
 
 

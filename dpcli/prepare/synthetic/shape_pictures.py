@@ -54,7 +54,7 @@ class PosedModels:
 
     def draw(self, device: torch.device | str = "cpu") -> LayeredViews:
         """Draws the pictures of the round, in random order. Raises DataError where no model shows anything."""
-        rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, self.number, 1)
+        rng = generator(self.seed, PrepareStream.SHAPE_VIEWS, self.number)
         found = draw_views(self.meshes, self.views, self.size, rng, warp=self.warp, device=device)
         if not len(found.rgba):
             raise DataError(f"none of {len(self.meshes)} models shows anything; are they whole?")
