@@ -88,7 +88,8 @@ def without_matlab_counting(data: dict[str, Any]) -> dict[str, Any]:
     else:
         focal, center = own.get("focallength"), own.get("principalpoint")
     try:
-        told |= dict(zip(("fx", "fy", "cx", "cy"), (*focal, *(float(at) - 1 for at in center))))
+        (told["fx"], told["fy"]), (cx, cy) = focal, center
+        told |= {"cx": float(cx) - 1, "cy": float(cy) - 1}
     except (TypeError, ValueError):
         return data
     size = own.get("imagesize")

@@ -367,12 +367,18 @@ OF_ONE = [[FX, 0, CX + 1], [0, FY, CY + 1], [0, 0, 1]]  # as MATLAB counts pixel
         ("c.json", json.dumps(MATLAB | {"K": OF_ONE})),
         ("c.json", json.dumps(MATLAB | {"IntrinsicMatrix": np.transpose(OF_ONE).tolist()})),
         ("c.json", json.dumps(MATLAB | {"FocalLength": [FX, FY], "PrincipalPoint": [CX + 1, CY + 1]})),
-        ("Calib_Results.m", f"% of Bouguet's toolbox\nfc = [ {FX} ; {FY} ];\ncc = [ {CX} ; {CY} ];\nalpha_c = 0.0;\n"
-         "kc = [ 0 ; 0 ; 0 ; 0 ; 0 ];\nfc_error = [ 1 ; 1 ];\nnx = 640;\nny = 480;\n"),
-        ("ost.ini", f"# oST version 5.0 parameters\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[narrow_stereo]\n\ncamera matrix\n"
-         f"{FX} 0.0 {CX}\n0.0 {FY} {CY}\n0.0 0.0 1.0\n\ndistortion\n0.0 0.0 0.0 0.0 0.0\n"),
+        (
+            "Calib_Results.m",
+            f"% of Bouguet's toolbox\nfc = [ {FX} ; {FY} ];\ncc = [ {CX} ; {CY} ];\nalpha_c = 0.0;\n"
+            "kc = [ 0 ; 0 ; 0 ; 0 ; 0 ];\nfc_error = [ 1 ; 1 ];\nnx = 640;\nny = 480;\n",
+        ),
+        (
+            "ost.ini",
+            f"# oST version 5.0 parameters\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[narrow_stereo]\n\ncamera matrix\n"
+            f"{FX} 0.0 {CX}\n0.0 {FY} {CY}\n0.0 0.0 1.0\n\ndistortion\n0.0 0.0 0.0 0.0 0.0\n",
+        ),
     ],
-)  # fmt: skip
+)
 def test_calibrations_of_matlab_and_of_ros_as_ini(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     found = read_calibration(tmp_path / name)

@@ -37,9 +37,14 @@ def scan(make: Messages, points: np.ndarray, stamp: int, place: str = "livox", p
         for k, (x, y, z) in enumerate(points.tolist())
     ]
     return make.make(
-        f"{package}/msg/CustomMsg", header=make.header(stamp, place), timebase=stamp, point_num=len(rows), lidar_id=1,
-        rsvd=np.zeros(3, np.uint8), points=rows,
-    )  # fmt: skip
+        f"{package}/msg/CustomMsg",
+        header=make.header(stamp, place),
+        timebase=stamp,
+        point_num=len(rows),
+        lidar_id=1,
+        rsvd=np.zeros(3, np.uint8),
+        points=rows,
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -45,12 +45,20 @@ class Round:
     thickness: Tensor
     depth: Tensor
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travels between processes as arrays: of tensors torch would make a file in shared memory each."""
+        return _of_arrays, (self.rgba.numpy(), self.thickness.numpy(), self.depth.numpy())
+
     def take(self, rows: np.ndarray) -> Batch:
         """Returns the pictures of these rows."""
         index = torch.from_numpy(rows).to(self.rgba.device)
         rgba = self.rgba[index].float() / 255
         pictures = torch.cat([rgba[:, :3] * rgba[:, 3:], rgba[:, 3:], self.thickness[index].float()[:, None]], 1)
         return Batch(pictures, self.depth[index].float())
+
+
+def _of_arrays(*arrays: np.ndarray) -> Round:
+    return Round(*map(torch.from_numpy, arrays))
 
 
 def draw_round(models: Models, device: torch.device | str = "cpu") -> Round:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from functools import partial
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -74,3 +76,12 @@ def test_variation_keeps_layers_on_their_pixels():
     rising = torch.nan_to_num(varied.depth[:, 0].diff(dim=-1)).sum((1, 2)) > 0
     assert 16 < int(rising.sum()) < 48  # about half are mirrored
     assert len({tuple(color) for color in varied.pictures[:, :3, 12, 12].numpy().round(3).tolist()}) > 20
+
+
+def test_a_round_goes_to_another_process_without_shared_memory():
+    """What is sent holds all its bytes, and no handle of a file that a small /dev/shm or few open files could refuse."""
+    one = draw_round(_Models(7, 5))
+    sent = bytes(ForkingPickler.dumps(one))
+    assert len(sent) > sum(tensor.numel() * tensor.element_size() for tensor in (one.rgba, one.thickness, one.depth))
+    again = pickle.loads(sent)
+    assert all(torch.equal(getattr(again, key), getattr(one, key)) for key in ("rgba", "thickness", "depth"))
