@@ -21,7 +21,7 @@ def train_prior(
     given: Given,
     meshes: Annotated[
         list[Path] | None,
-        typer.Argument(help="Models (.glb, .gltf) or folders of them; none: made-up creatures alone."),
+        typer.Argument(help="Models (.glb, .gltf) or folders of them; none: made-up creatures and things alone."),
     ] = None,
     seed: Seed = 0,
     jobs: Annotated[
@@ -30,7 +30,7 @@ def train_prior(
     device: Device = "auto",
     force: Force = False,
 ) -> None:
-    """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures.
+    """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures and things.
 
     Running again continues.
     """

@@ -1,4 +1,4 @@
-"""Rounds of pictures with layers for the training of a shape prior: from models, moving or still, and made-up creatures.
+"""Rounds of pictures with layers for the training of a shape prior: of models, moving or still, and of what is made up.
 
 A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen. Its
 models are read and posed by one process and may be drawn by another, which has a GPU.
@@ -20,6 +20,7 @@ from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_
 from dpcli.prepare.meshes.layered_views import LayeredViews, PosedMesh, draw_views, posed
 from dpcli.prepare.synthetic.creature_mesh import animated_creature, make_skin
 from dpcli.prepare.synthetic.gait import bone_motion
+from dpcli.prepare.synthetic.made_thing import made_thing
 from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
 from dpcli.regular_files import why_unreadable
 from dpcli.runtime.progress import log
@@ -27,6 +28,7 @@ from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.text_files import read_text
 
 _POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
+_THINGS = 0.3  # of what is made up; creatures are the rest
 _MOST_MISSES = 200  # models in a row that show nothing
 _SAID: set[str] = set()  # what was said of models in this process
 _MOST_TRIANGLES = 200_000  # larger models are passed over, since one would hold up all others
@@ -64,8 +66,8 @@ class PosedModels:
 
 @dataclass(frozen=True)
 class PictureSource:
-    """Makes rounds of pictures. made, moving: shares of made-up creatures and of animated models, 0..1; still models have
-    the rest. A folder's share grows with the root of its number of models: many of them are alike. views: pictures of each
+    """Makes rounds of pictures. made, moving: shares of made-up creatures and things and of animated models, 0..1; still
+    models have the rest. A folder's share grows with the root of its number of models: many of them are alike. views: pictures of each
     model in a round. warp: how far proportions are changed at random.
     """
 
@@ -102,7 +104,7 @@ class PictureSource:
         moving = [file for file in self.files if file.clips]
         still = [file for file in self.files if not file.clips]
         if kind < self.made or not self.files:
-            return made_creature(rng)
+            return made_thing(rng, _POSES) if rng.random() < _THINGS else made_creature(rng)
         if moving and (kind < self.made + self.moving or not still):
             return _read(_draw_file(moving, rng), rng)
         return _read(_draw_file(still, rng), rng)
@@ -119,7 +121,7 @@ def picture_sources(
     views: int = 6,
     warp: float = 0.0,
 ) -> tuple[PictureSource, PictureSource]:
-    """Returns the source to learn from and the one to validate on: held-out models alone, made-up creatures without any."""
+    """Returns the source to learn from and the one to validate on: held-out models alone, what is made up without any."""
     return (
         PictureSource(tuple(learned), size, seed, made, moving, views, warp),
         PictureSource(tuple(held), size, seed, made=0.0, moving=1.0),

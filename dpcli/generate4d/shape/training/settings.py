@@ -34,7 +34,7 @@ class ShapeSchedule:
 class ShapeData:
     """Holds what the pictures of a training show."""
 
-    made: float = setting(0.5, "Share of made-up creatures.", least=0, most=1)
+    made: float = setting(0.5, "Share of made-up creatures and things.", least=0, most=1)
     moving: float = setting(0.35, "Share of models with animations; still models have the rest.", least=0, most=1)
     views: int = setting(
         6, "Pictures of each model in a round, in some poses; more are cheap on a GPU.", least=1, most=4096

@@ -100,7 +100,7 @@ def frame(axis: np.ndarray) -> np.ndarray:
 
 
 class Builder:
-    """Holds collects bodies, each a list of solids in its own frame. Body 0 is there from the start."""
+    """Collects bodies, each a list of solids in its own frame. Body 0 is there from the start."""
 
     def __init__(self) -> None:
         self._joints: list[Joint] = []
