@@ -100,8 +100,11 @@ def read_segments(path: str | Path, text: str | None = None) -> Segments:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text("utf-8-sig")
-    except UnicodeDecodeError:
+        text = path.read_text("utf-8-sig")
+        if "\0" in text:
+            raise UnicodeError
+        return text
+    except UnicodeError:
         raise DataError(f"{path}: no text; expected segments as .csv or .json") from None
     except OSError as error:
         raise DataError(f"{path}: can't be read ({error.strerror})") from None
