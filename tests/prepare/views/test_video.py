@@ -9,7 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -735,7 +735,9 @@ def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.nda
 def test_the_upright_is_the_axis_about_which_cameras_stand_level(angles, order, signs):
     turn = np.eye(3)[order] * np.array(signs)[:, None]
     turn = turn * np.linalg.det(turn)  # no mirror
-    np.testing.assert_allclose(up_of_cameras("a", level_cameras(angles, turn)), turn @ [0, 0, 1], atol=1e-9)
+    poses, up = level_cameras(angles, turn), turn @ [0, 0, 1]
+    assume(up[2] or np.abs(poses[:, 0, 2]).max() > 0.11)  # else they may look down in a world of z up
+    np.testing.assert_allclose(up_of_cameras("a", poses), up, atol=1e-9)
 
 
 def test_cameras_from_straight_above_and_rolled_ones_leave_z_up(capsys):
