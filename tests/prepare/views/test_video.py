@@ -18,6 +18,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
+from dpcli.prepare.views.given_views import read_cameras
 from dpcli.prepare.views.orbit_world import up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
@@ -478,6 +479,15 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     assert clip.header.role == ["reference", "train", "test"]
     assert orbit_of(clip.header.world_to_camera[1])[2] == pytest.approx(3)
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
+
+
+@pytest.mark.parametrize("scale, told", [(np.pi / 180, True), (1, False)])
+def test_cameras_in_radians_are_told(tmp_path, capfd, scale, told):
+    angles = [(0, 10), (90, 10), (200, -20)]
+    entries = [{"azimuth": scale * azimuth, "elevation": scale * elevation} for azimuth, elevation in angles]
+    (tmp_path / "c.json").write_text(json.dumps(entries))
+    read_cameras(tmp_path / "c.json")
+    assert ("are they radians?" in capfd.readouterr().err) == told
 
 
 def test_views_belong_to_the_frames_that_are_used(tmp_path):
