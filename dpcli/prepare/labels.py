@@ -31,6 +31,8 @@ _PERHAPS = {  # where no column is called as above; the first two only together
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")  # as programs write a column of numbers that has a gap
 _NUMBERED = re.compile(r"([^\W\d]+[ _.-]?)(\d{1,9})")  # such as s01
+_BETWEEN = re.compile(r"[\s_-]+")
+_DIVIDER_TOLD = re.compile(r"\s*\"?sep=.\"?\s*\n")  # a first line for spreadsheets
 _NOTHING = {"nan", "null", "n/a", "#n/a"}  # as programs write a cell without a value
 
 
@@ -100,6 +102,8 @@ def read_labels(path: Path) -> LabelTable:
 
     try:
         text = decode_text(path).lstrip("\ufeff")
+        if told := _DIVIDER_TOLD.match(text):
+            text = "\n" + text[told.end() :]  # lines keep their numbers
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
         divider = next((mark for mark in ",;\t" if mark in first), ",")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
@@ -255,12 +259,18 @@ def _people(subjects: Iterable[str]) -> dict[str, str]:
 
 
 def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> None:
-    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals alone."""
+    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals, in spaces and the
+    like, or in how letters are composed.
+    """
     if 0 not in labels:
         log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")
-    for low, count in Counter(name.casefold() for name in class_names).items():
+    for alike, count in Counter(map(_folded, class_names)).items():
         if count > 1:
-            log.warn(f"{path}: {' and '.join(n for n in class_names if n.casefold() == low)} are different classes")
+            log.warn(f"{path}: {' and '.join(n for n in class_names if _folded(n) == alike)} are different classes")
+
+
+def _folded(name: str) -> str:
+    return _BETWEEN.sub(" ", unicodedata.normalize("NFKC", name).casefold())
 
 
 def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:

@@ -99,3 +99,25 @@ def test_splits_of_other_names_are_told(tmp_path, capsys, word):
 def test_a_cell_without_a_value_is_no_class(tmp_path, cell):
     with pytest.raises(DataError, match=r"labels\.csv:3"):
         table(tmp_path, f"name,label\na,wave\nb,{cell}\n")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "told"),
+    [
+        ("two hand wave", "two_hand  Wave", True),
+        ("gr\u00f6\u00dfe", "gro\u0308\u00dfe", True),
+        ("wave1", "wave 1", False),
+        ("a-b", "a b", True),
+    ],
+)
+def test_classes_that_look_alike_are_told(tmp_path, capsys, one, other, told):
+    (tmp_path / "labels.csv").write_text(f"name,label\na,{one}\nb,{other}\n", encoding="utf-8")
+    assert len(read_labels(tmp_path / "labels.csv").class_names) == 2
+    assert ("are different classes" in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize("line", ["sep=;\n", '"sep=;"\r\n', "\ufeffsep=;\n"])
+def test_a_line_that_tells_spreadsheets_the_divider_is_none_of_the_table(tmp_path, line):
+    (tmp_path / "labels.csv").write_text(line + "name;label\na;wave\nb;\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"labels\.csv:4: 'b,'"):
+        read_labels(tmp_path / "labels.csv")
