@@ -18,7 +18,7 @@ _MAGIC = 0x5053474E
 _REST = {1: 10, 2: 10, 3: 11}  # bytes of a Gaussian after its center, by version: opacity, color, scales, rotation
 _COLOR_SCALE = 0.15  # of the color's harmonics in a byte
 _PACKED_AT_MOST = 1100  # times that zlib makes anything smaller
-_UNREAD = ("scale", "rotation", "opacity")
+_UNREAD = ("opacity, size and rotation of Gaussians (no names)",)
 
 
 def read_splat(path: Path, keep: Sequence[str] = ()) -> Cloud:
