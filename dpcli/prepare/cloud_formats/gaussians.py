@@ -1,10 +1,12 @@
-"""Gaussians in the files of players: `.splat` (antimatter15) and `.spz` (Niantic, versions 1 to 3), their centers and colors."""
+"""Gaussians in the files of players, their centers and colors: `.splat` (antimatter15), `.spz` (Niantic, versions 1 to 3), and
+the columns of a `.ply` that SuperSplat compressed.
+"""
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ _MAGIC = 0x5053474E
 _REST = {1: 10, 2: 10, 3: 11}  # bytes of a Gaussian after its center, by version: opacity, color, scales, rotation
 _COLOR_SCALE = 0.15  # of the color's harmonics in a byte
 _PACKED_AT_MOST = 1100  # times that zlib makes anything smaller
+_IN_CHUNK = 256  # Gaussians that SuperSplat packs between the same ends
 _UNREAD = ("opacity, size and rotation of Gaussians (no names)",)
 
 
@@ -64,6 +67,37 @@ def _centers(body: bytes, count: int, bits: int | None) -> np.ndarray:
     low, middle, high = np.frombuffer(body, np.uint8, 9 * count).reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
     whole = low | middle << 8 | high << 16
     return ((whole - ((whole & 1 << 23) << 1)) / 2.0**bits).astype(np.float32)
+
+
+def unpack_supersplat(
+    path: Path, chunks: Mapping[str, np.ndarray], rows: Mapping[str, np.ndarray], keep: Sequence[str]
+) -> Cloud:
+    """Returns the Gaussians of the packed columns (N) of a compressed ``.ply``, between the ends that chunks of 256 tell.
+
+    Raises DataError where chunks lack, or columns.
+    """
+    _refuse_kept(path, keep)
+    try:
+        packed, shades = (rows[f"packed_{name}"].astype(np.int64) for name in ("position", "color"))
+        low, high = (np.stack([chunks[f"{end}_{axis}"] for axis in "xyz"], 1) for end in ("min", "max"))
+        tints = (
+            [np.stack([chunks[f"{end}_{axis}"] for axis in "rgb"], 1) for end in ("min", "max")]
+            if "min_r" in chunks
+            else []
+        )
+    except KeyError as error:
+        raise DataError(
+            f"{path}: Gaussians that SuperSplat compressed, without {error}; export them as plain .ply"
+        ) from None
+    if len(low) * _IN_CHUNK < len(packed):
+        raise DataError(f"{path}: {len(low)} chunks for {len(packed)} Gaussians; expected one for each {_IN_CHUNK}")
+    own = np.arange(len(packed)) // _IN_CHUNK
+    shares = np.stack([(packed >> 21 & 2047) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], 1)
+    color = np.stack([shades >> shift & 255 for shift in (24, 16, 8)], 1) / 255
+    if tints:
+        color = tints[0][own] + color * (tints[1] - tints[0])[own]
+    points = low[own] + shares * (high - low)[own]
+    return Cloud(points.astype(np.float32), np.rint(255 * color.clip(0, 1)).astype(np.uint8), unread=_UNREAD)
 
 
 def _refuse_kept(path: Path, keep: Sequence[str]) -> None:

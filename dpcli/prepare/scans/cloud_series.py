@@ -38,7 +38,7 @@ _ADVICE = {
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
     ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
-    **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat, not compressed"),
+    **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
     **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
     ".e57": "save their points as .ply, such as with CloudCompare",
 }

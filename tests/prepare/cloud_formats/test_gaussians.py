@@ -8,12 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import plyfile
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.gaussians import read_splat, read_spz
+from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.store import CloudsReader
 from dpcli.store.gaussians import write_scene
 from tests.support.commands import exit_code
@@ -61,6 +63,39 @@ def test_splat(tmp_path):
     assert np.array_equal(cloud.color, color) and cloud.unread
 
 
+@pytest.mark.parametrize("tinted", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_gaussians_that_supersplat_packed(tmp_path, tinted, order):
+    rng, count = np.random.default_rng(5), 600
+    axes = [*"xyz", *("rgb" if tinted else "")]
+    ends = {
+        axis: np.sort(rng.uniform(0, 1, (3, 2)) if axis in "rgb" else rng.uniform(-9, 9, (3, 2)), 1) for axis in axes
+    }
+    chunks = np.zeros(3, [(f"{end}_{axis}", "f4") for axis in axes for end in ("min", "max")])
+    for axis, values in ends.items():
+        chunks[f"min_{axis}"], chunks[f"max_{axis}"] = values.T
+    share = [rng.integers(0, 1 << bits, count) for bits in (11, 10, 11)]
+    shade = rng.integers(0, 256, (count, 4))
+    rows = np.zeros(count, [(f"packed_{name}", "u4") for name in ("color", "position", "rotation", "scale")])
+    rows["packed_position"] = share[0] << 21 | share[1] << 11 | share[2]
+    rows["packed_color"] = shade @ (1 << np.array([24, 16, 8, 0]))
+    parts = [plyfile.PlyElement.describe(array, name) for array, name in ((chunks, "chunk"), (rows, "vertex"))]
+    plyfile.PlyData(parts, byte_order=order).write(str(tmp_path / "a.ply"))
+    cloud, own = read_ply(tmp_path / "a.ply"), np.repeat([0, 1, 2], 256)[:count]
+
+    def between(axis: str, part: np.ndarray) -> np.ndarray:
+        low, high = np.float32(ends[axis]).T
+        return low[own] + part * (high - low)[own]
+
+    expected = [between(axis, part / largest) for axis, part, largest in zip("xyz", share, (2047, 1023, 2047))]
+    np.testing.assert_allclose(cloud.points, np.stack(expected, 1), atol=1e-5)
+    color = [between(axis, part) if tinted else part for axis, part in zip("rgb", shade[:, :3].T / 255)]
+    np.testing.assert_allclose(cloud.color, 255 * np.stack(color, 1), atol=0.51)
+    plyfile.PlyData([plyfile.PlyElement.describe(chunks[:2], "chunk"), parts[1]]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(DataError, match="2 chunks for 600 Gaussians"):
+        read_ply(tmp_path / "b.ply")
+
+
 @pytest.mark.parametrize(
     ("name", "data", "told"),
     [
@@ -84,9 +119,9 @@ def test_damaged_gaussians_are_named(tmp_path, name, data, told):
         (read_splat if name.endswith("splat") else read_spz)(tmp_path / name)
 
 
-@pytest.mark.parametrize("kind", ["ply-sequence", "splat-sequence", "spz"])
+@pytest.mark.parametrize("kind", ["ply-sequence", "splat-sequence", "spz", "compressed.ply"])
 def test_exports_of_a_scene_come_back_as_clouds(tmp_path, kind):
-    if kind == "spz":
+    if kind in ("spz", "compressed.ply"):
         pytest.importorskip("gsply")
     scene = toy_scene(per_part=20, frames=3)
     write_scene(tmp_path / "s.h5", scene)
