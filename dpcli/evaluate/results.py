@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.text_tables import TextTable
 from dpcli.path_names import first_names
+from dpcli.runtime.progress import log
 
 _NAMES_IN_NOTE = 10
 
@@ -44,6 +46,15 @@ def counted_split(split: str | None, splits: Sequence[str]) -> str:
     splits: the split of each sample.
     """
     return split or ("test" if "test" in splits else "all")
+
+
+def tell_split(path: str | Path, split: str | None, splits: Sequence[str]) -> None:
+    """Warns where no split was asked for and no sample is of "test", so that those of "train" count, beside others."""
+    if split is None and "test" not in splits and {"train"} < {*splits}:
+        found = list_names(sorted({*splits} - {"train"}))
+        log.warn(
+            f"{path}: no split is called 'test', so all samples count, those of 'train', too; there are {found} (--split)"
+        )
 
 
 def list_names(names: Sequence[str]) -> str:

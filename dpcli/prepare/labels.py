@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.reader import Item, split_called
+from dpcli.prepare.reader import SPLITS, Item, split_called
 from dpcli.runtime.progress import log
 
 _COLUMNS = ("name", "label", "subject", "split")
@@ -22,8 +22,18 @@ _CALLED = {"file": "name", "filename": "name", "path": "name", "video": "name", 
     "person": "subject",
     "subset": "split",
 }
+_PERHAPS = {  # where no column is called as above; the first two only together
+    "name": "clip sequence recording id file_name video_id video_name sample_id sample_name sequence_id sequence_name",
+    "label": "action gesture activity target class_name label_name class_label",
+    "subject": "actor user performer participant signer subject_id person_id user_id",
+    "split": "set partition",
+}
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")  # as programs write a column of numbers that has a gap
+_NUMBERED = re.compile(r"([^\W\d]+[ _.-]?)(\d{1,9})")  # such as s01
+_BETWEEN = re.compile(r"[\s_-]+")
+_DIVIDER_TOLD = re.compile(r"\s*\"?sep=.\"?\s*\n")  # a first line for spreadsheets
+_NOTHING = {"nan", "null", "n/a", "#n/a"}  # as programs write a cell without a value
 
 
 @dataclass(frozen=True)
@@ -92,6 +102,8 @@ def read_labels(path: Path) -> LabelTable:
 
     try:
         text = decode_text(path).lstrip("\ufeff")
+        if told := _DIVIDER_TOLD.match(text):
+            text = "\n" + text[told.end() :]  # lines keep their numbers
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
         divider = next((mark for mark in ",;\t" if mark in first), ",")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
@@ -119,7 +131,8 @@ def read_labels(path: Path) -> LabelTable:
     for number, row in numbered:
         record = dict(zip(header, row, strict=False))
         row = row[: len(header)] if not any(row[len(header) :]) else row  # a line may end with the divider
-        if len(row) != len(header) or not record["name"] or not record["label"]:
+        lacking = not record.get("label") or record["label"].lower() in _NOTHING
+        if len(row) != len(header) or not record["name"] or lacking:
             raise DataError(f"{path}:{number}: {','.join(row)!r}; expected {','.join(header)}")
         if record["name"] in records:
             raise DataError(f"{path}:{number}: {record['name']!r} appears twice")
@@ -134,12 +147,20 @@ def _header(row: list[str]) -> list[str]:
     names = [_CALLED.get(cell.lower(), cell.lower()) for cell in row]
     while names and not names[-1]:
         names.pop()
+    guessed = list(names)
+    for field, words in _PERHAPS.items():
+        places = [place for place, name in enumerate(names) if name in words.split()]
+        if field not in names and len(places) == 1:
+            guessed[places[0]] = field
+    if "name" in guessed and "label" in guessed:
+        return guessed
     return names if "name" in names else []
 
 
 def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTable:
     """Takes each name's first folder for its class; where all begin with train, val(idation) or test, that is the split
-    and the next one the class. Classes are numbered in alphabetical order.
+    and the next one the class, and where these come second in all, they are the splits. Classes are numbered in
+    alphabetical order.
 
     names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. Raises
     DataError when one holds less, or when most lie in folders of splits and some do not: those splits would silently
@@ -167,6 +188,9 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     _warn_of_classes(root, class_names, {0})
     _warn_of_levels(root, [own[divided:] for own in parts.values()])
     splits = {name: split_called(own[0]) if divided else "" for name, own in parts.items()}
+    if not divided and all(len(own) > least for own in parts.values()):
+        second = {name: split_called(own[1]) for name, own in parts.items()}
+        splits = second if all(second.values()) and len({*second.values()}) > 1 else splits
     rows = {name: Row(class_names.index(own), -1, splits[name]) for name, own in classes.items()}
     return LabelTable(root, rows, class_names)
 
@@ -176,8 +200,10 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     are the same. parts: of every name, from its class on.
     """
     below: dict[str, set[str]] = {}
+    people = all(re.fullmatch(r"\D*\d+", own[0]) for own in parts)  # s1/wave, s2/wave
     for own in parts:
-        below.setdefault(own[0], set()).update(own[1:2] if len(own) > 2 else ())
+        inner = len(own) > 2 or people and not re.search(r"\d", "".join(own[1:2]))
+        below.setdefault(own[0], set()).update(own[1:2] if inner else ())
     alike = {frozenset(names) for names in below.values()}
     same = next(iter(alike), frozenset())
     if len(alike) != 1 or len(same) < 2 or all(map(split_called, same)):
@@ -206,27 +232,45 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
     else:
         class_names = sorted(set(words))
     _warn_of_classes(path, class_names, {int(word) for word in words} if all(map(_is_number, words)) else {0})
-    rows = {}
+    rows, people = {}, _people(record.get("subject", "") for record in records.values())
     for name, record in records.items():
         where = f"{path}:{record['line']}"
         label = int(record["label"]) if _is_number(record["label"]) else class_names.index(record["label"])
         if label < 0:
             raise DataError(f"{where}: label {label} is out of range; labels count from 0")
-        subject = record.get("subject", "") or "-1"
+        subject = people.get(record.get("subject", ""), record.get("subject", "")) or "-1"
         if not _is_number(subject) or len(subject) > 10 or int(subject) >= 1 << 31:
             raise DataError(f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31")
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), split_called(split) or split)
+    if strange := sorted({row.split for row in rows.values()} - {*SPLITS, ""}):
+        log.warn(f"{path}: splits that are none of {', '.join(SPLITS)} stay as they are: {first_names(strange)}")
     return LabelTable(path, rows, class_names)
 
 
+def _people(subjects: Iterable[str]) -> dict[str, str]:
+    """Returns the numbers in subjects that are all spelled alike, such as s01 and s12, or 1.0; {} where they aren't."""
+    known = {subject for subject in subjects if subject}
+    whole = {subject: _WHOLE.sub(r"\1", subject) for subject in known}
+    found = [_NUMBERED.fullmatch(subject) for subject in whole.values()]
+    if known and all(found) and len({match[1] for match in found if match}) == 1:
+        return {subject: str(int(match[2])) for subject, match in zip(whole, found) if match}
+    return whole
+
+
 def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> None:
-    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals alone."""
+    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals, in spaces and the
+    like, or in how letters are composed.
+    """
     if 0 not in labels:
         log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")
-    for low, count in Counter(name.casefold() for name in class_names).items():
+    for alike, count in Counter(map(_folded, class_names)).items():
         if count > 1:
-            log.warn(f"{path}: {' and '.join(n for n in class_names if n.casefold() == low)} are different classes")
+            log.warn(f"{path}: {' and '.join(n for n in class_names if _folded(n) == alike)} are different classes")
+
+
+def _folded(name: str) -> str:
+    return _BETWEEN.sub(" ", unicodedata.normalize("NFKC", name).casefold())
 
 
 def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:

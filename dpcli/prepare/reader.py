@@ -21,6 +21,7 @@ _SPLIT_WORDS = {
     "valid": "validation",
     "testing": "test",
 }
+_AFFIX = re.compile(r"^(?:split|set|data|subset)[ _.-]+|[ _.-]*(?:split|set|data|subset|videos|clips|samples)$")
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,10 @@ class Sample:
 def split_called(word: str) -> str:
     """Returns the split that people call by this word, in any case, as a folder or in a table; "" when it is none.
 
-    >>> [split_called(word) for word in ("Train", "val", "testing", "wave")]
+    >>> [split_called(word) for word in ("Train", "val", "test_set", "wave")]
     ['train', 'validation', 'test', '']
     """
-    return _SPLIT_WORDS.get(word.strip().lower(), "")
+    return _SPLIT_WORDS.get(_AFFIX.sub("", word.strip().lower()), "")
 
 
 class Reader(Protocol):

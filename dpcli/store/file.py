@@ -27,6 +27,7 @@ _TEXTS = ("dpc_version", "command", "source", "length_unit", "name", "metrics") 
 _NUMBERS = ("seed", "skipped", "reference", "num_parts", "num_points")
 STRING = h5py.string_dtype("utf-8")
 
+_FROM_RAW = "`dpc prepare` makes them from raw data"
 _CACHE = 1 << 20  # bytes, HDF5's own choice
 
 
@@ -55,7 +56,9 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
     if not magic:
         raise DataError(f"{path}: the file is empty, expected HDF5; did the command that writes it fail?")
     if magic != _MAGIC:
-        raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); `dpc prepare` makes them from raw data")
+        makers = [f"dpcli.store.{kind.capitalize()}Writer" for kind in kinds if kind in ("scores", "parts")]
+        made = f"what another program predicted, {makers[0]} writes" if len(kinds) == len(makers) else _FROM_RAW
+        raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); {made}")
     check_heaps(path)
     try:
         file = StoreFile(path, "r", rdcc_nbytes=cache)

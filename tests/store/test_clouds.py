@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.runtime.provenance import file_digest
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, file_kind
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader, ScoresReader, file_kind
 
 
 def write(path: Path, sequences: list[CloudSequence], **options) -> Path:
@@ -309,6 +309,13 @@ def test_kind_is_told_and_text_is_not_hdf5(tmp_path, three):
     (tmp_path / "b.h5").write_text("name,label\n")
     with pytest.raises(DataError, match="not an HDF5 file"):
         file_kind(tmp_path / "b.h5")
+    for reader, advice in (
+        (ScoresReader, "ScoresWriter"),
+        (PartsReader, "PartsWriter"),
+        (CloudsReader, "`dpc prepare`"),
+    ):
+        with pytest.raises(DataError, match=advice):
+            reader(tmp_path / "b.h5")
     with pytest.raises(DataError, match="a folder"):
         file_kind(tmp_path)
 

@@ -18,7 +18,7 @@ from dpcli.evaluate.classification.metrics import (
     predicted_labels,
 )
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
-from dpcli.evaluate.results import LeftOut, counted_split
+from dpcli.evaluate.results import LeftOut, counted_split, tell_split
 from dpcli.store import ScoresReader
 
 FUSED = "fused"  # the file's main scores, when it also holds those of single streams
@@ -79,6 +79,7 @@ def evaluate_classification(
     if not scores.names:
         raise DataError(f"{path}: holds no samples; predict again")
     found = labels_in_file(scores) if truth is None else match_labels(scores, truth, split, intersect)
+    tell_split(truth or path, split, found.splits)
     split = counted_split(split, found.splits)
     keep, left_out = _choose_samples(scores, found, split)
     labels = found.labels[keep]

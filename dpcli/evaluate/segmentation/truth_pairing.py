@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.results import LeftOut, counted_split, list_names
+from dpcli.evaluate.results import LeftOut, counted_split, list_names, tell_split
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
 
 
@@ -52,6 +52,7 @@ class PairedSequences:
             )
         self.fields = tuple(instead if missing else fields)
         self._check_unit()
+        tell_split(truth, split, self.truth.splits)
         self.split = counted_split(split, self.truth.splits)
         self.left_out: list[LeftOut] = []
         self.rows = self._match_names(intersect)

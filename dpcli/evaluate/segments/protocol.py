@@ -20,7 +20,9 @@ from dpcli.evaluate.results import (
     samples_json,
 )
 from dpcli.evaluate.segments.metrics import METRICS, OVERLAPS, RecordingCounts, count_recording, segments_weighted
+from dpcli.evaluate.segments.truth_check import check_classes, doubts_of_frames
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
+from dpcli.runtime.progress import log
 from dpcli.store.tables.segments import Segments
 
 _TITLES = {"frame_accuracy": "frame accuracy", "edit_score": "edit score"}
@@ -55,7 +57,9 @@ def evaluate_segments(
     resampling = resampling or Resampling(0)
     names = [name for name in true.recordings if name in predicted.recordings]
     left_out = _left_out(predicted, true, names, truth, intersect)
-    _check_classes(predicted, true, names, truth)
+    check_classes(predicted, true, names, truth)
+    for doubt in doubts_of_frames(predicted, true, names):
+        log.warn(f"{truth}: {doubt}")
     counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
     metric = segments_weighted(counts)
     values = {key: float(value[0]) for key, value in metric(np.ones((1, len(counts)))).items()}
@@ -72,21 +76,6 @@ def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: 
         raise DataError(f"{truth}: {side} {list_names(lacking)}; --intersect evaluates the recordings that both have")
     entries = [LeftOut("the truth doesn't have", unknown), LeftOut("not predicted", missing)]
     return [entry for entry in entries if entry.names]
-
-
-def _check_classes(predicted: Segments, true: Segments, names: Sequence[str], truth: str) -> None:
-    """Raises DataError where the truth has classes and the prediction could name none of them: their spelling differs."""
-    said = {*predicted.class_names, *_names_in(predicted, names)} - {""}
-    given = _names_in(true, names) - {""}
-    if given and said and not given & said:
-        raise DataError(
-            f"{truth}: its classes ({list_names(sorted(given))}) are none of those predicted ({list_names(sorted(said))}); "
-            "spell them alike"
-        )
-
-
-def _names_in(table: Segments, names: Sequence[str]) -> set[str]:
-    return {one.name for name in names for one in table.recordings[name]}
 
 
 def segments_tables(report: SegmentsReport) -> list[TextTable]:

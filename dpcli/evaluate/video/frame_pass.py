@@ -53,6 +53,7 @@ class FramePass:
     brightest: tuple[int, int] = (0, 0)  # 8-bit color of the prediction, of the truth, until one is plausible
     hollow: int = 0  # predicted pictures without an object
     swapped: str = ""  # the first picture that seems to have red and blue swapped
+    misnumbered: str = ""  # the first frames whose names are numbered in different steps
 
     def score_views(self, pairs: Iterable[tuple[int, int]]) -> list[ViewScore]:
         """Returns the picture metrics of each pair of views, (index in the prediction, index in the truth)."""
@@ -107,6 +108,7 @@ class FramePass:
         """Returns how many frames of a pair of views are compared."""
         own, other = (s.frames[i] if s.frames else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
         if own is None or own == other:
+            self.misnumbered = self.misnumbered or self._numbered_otherwise(ours, theirs)
             return int(other)
         if not self.intersect:
             title = self.truth.views[theirs].title
@@ -121,6 +123,14 @@ class FramePass:
             )
         )
         return min(own, other)
+
+    def _numbered_otherwise(self, ours: int, theirs: int) -> str:
+        """Returns, in words, the first frames that the names of both sides number in different steps; "" without such."""
+        own, other = (s.numbers[i] if s.numbers else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
+        if own is None or other is None:
+            return ""
+        odd = [k for k in range(1, len(own)) if own[k] - own[k - 1] != other[k] - other[k - 1]]
+        return f"{own[odd[0]]} with {other[odd[0]]}" if odd else ""
 
     def _frame_jobs(
         self, ours: int, theirs: int, count: int, damaged: list[str]
@@ -200,6 +210,11 @@ class FramePass:
         if all(rates) and abs(rates[0] / rates[1] - 1) > _RATE:
             lines.append(
                 f"The prediction plays {rates[0]:.4g} frames a second, the truth {rates[1]:.4g}: compared by their number."
+            )
+        if self.misnumbered:
+            lines.append(
+                f"Frames are compared in their order, though their names number them otherwise ({self.misnumbered}): does one "
+                "side lack some, or have every second one?"
             )
         if self.swapped:
             lines.append(

@@ -46,7 +46,8 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     files = [raw] if raw.is_file() else _urdf_files(raw)
     if not files:
         others = sorted(file.relative_to(raw).as_posix() for kind in _OTHERS for file in raw.rglob(f"*.{kind}"))
-        some = f" ({others[0]} is none; xacro makes a URDF of a .xacro)" if others else ""
+        advice = "xacro FILE > robot.urdf makes one" if others and others[0].endswith("xacro") else "convert it first"
+        some = f" ({others[0]} is none; {advice})" if others else ""
         raise DataError(f"{raw}: no URDF found{some}; expected {_EXPECTED}")
     found = [_describe(raw, path) for path in files]
     counts = Counter(f.name for f in found)

@@ -60,7 +60,7 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
     """
     if not name:
         raise DataError(f"{path}: a mesh without a filename; name its file")
-    name = name.replace("\\", "/")  # written on Windows
+    name = name.replace("\\", "/").removeprefix("file://")  # written on Windows
     in_package = name.startswith(_PACKAGES)
     plain = name.split("://", 1)[1] if in_package else name
     plain = plain.lstrip("/") if in_package else plain  # package:///part.stl, of a package without a name

@@ -20,6 +20,7 @@ from dpcli.prepare.cloud_formats.cloud import (
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
+_CORNERS = ("faces", "face", "triangles", "tris", "cells", "indices", "edges")  # of meshes: numbers of points
 _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
 _TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
@@ -58,7 +59,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
     """Returns the name of the only array that can be points, numbers (N,3 or more); None when none or several can."""
-    others = (*_COLOR_KEYS, "normal", "normals")
+    others = (*_COLOR_KEYS, "normal", "normals", *_CORNERS)
     numbers = {k: a for k, a in arrays.items() if a.dtype.kind in "uif" and k not in others}
     found = [k for k, a in numbers.items() if a.ndim == 2 and a.shape[1] >= 3]
     return found[0] if len(found) == 1 else None
@@ -84,7 +85,18 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
             f"{path}: a matrix {array.shape} that turns, the pose of a camera; expected numbers (points, 3 or more)"
         )
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
-    return Cloud(array[:, :3].astype(kind), unread=unnamed_columns(4, array.shape[1]))
+    counted = _counts_rows(array)
+    unread = (*(("column 1 (no name, numbers of the rows)",) * counted), *unnamed_columns(4 + counted, array.shape[1]))
+    return Cloud(array[:, counted : counted + 3].astype(kind), unread=unread)
+
+
+def _counts_rows(array: np.ndarray) -> bool:
+    """Returns whether the first column of an array counts its rows, from 0 or 1, before three columns of fractions."""
+    if len(array) < 3 or array.shape[1] < 4 or array.dtype.kind != "f" or array[0, 0] not in (0, 1):
+        return False
+    axes = array[:, 1:4]
+    counts = np.array_equal(array[:, 0], np.arange(len(array)) + array[0, 0])
+    return counts and bool((axes != np.floor(axes)).any(0).all())
 
 
 def read_bin(path: Path, columns: int) -> Cloud:

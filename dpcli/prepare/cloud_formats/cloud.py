@@ -14,6 +14,7 @@ from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 _TINY = 1e-36  # below it and above its inverse lie no numbers but those whose bytes mean something else
 AT_ORIGIN = "points at (0,0,0) dropped"
 _WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
+_HARMONICS, _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2"), 0.28209479177387814  # of Gaussians: color seen from all sides
 MOST_UNNAMED = 40  # columns; a picture has more
 BEYOND = "points beyond the number that their file's header says dropped"
 
@@ -60,6 +61,8 @@ def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequen
     """
     names = list(columns)
     axes = named_axes(path, names)
+    if axes is None and "packed_position" in columns:
+        raise DataError(f"{path}: Gaussians that SuperSplat compressed; export them as plain .ply")
     if axes is None:
         raise DataError(f"{path}: fields {', '.join(names)[:80]}; expected x, y and z among them")
     points = as_points([columns[names[place]] for place in axes[0]])
@@ -70,6 +73,9 @@ def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequen
     elif colors:
         color = unpack_rgb(columns[names[colors[0]]])
         colors = colors if color is not None else []
+    elif set(_HARMONICS) <= columns.keys():
+        colors = [names.index(name) for name in _HARMONICS]
+        color = color_of_harmonics(np.stack([columns[name] for name in _HARMONICS], axis=1))
     used = tuple(names[place] for place in (*axes[0], *colors))
     return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used, without(names, used, keep))
 
@@ -140,6 +146,11 @@ def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
             f"{path}: --keep-fields {name}: float32, in which columns are kept, would round its values by up to {lost:.3g};"
             " keep smaller numbers, such as times since the beginning"
         )
+
+
+def color_of_harmonics(first: np.ndarray) -> np.ndarray:
+    """Returns colors u8 (N,3) of Gaussians from their spherical harmonics of degree 0 (N,3), as 3DGS has them."""
+    return np.rint(255 * np.clip(np.nan_to_num(0.5 + _SH0 * first.astype(np.float64)), 0, 1)).astype(np.uint8)
 
 
 def unpack_rgb(packed: np.ndarray) -> np.ndarray | None:

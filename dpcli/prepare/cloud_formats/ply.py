@@ -13,6 +13,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, require_points
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
+from dpcli.prepare.cloud_formats.gaussians import unpack_supersplat
 from dpcli.prepare.cloud_formats.text_numbers import TextTable
 
 _TYPES = {
@@ -49,7 +50,7 @@ class Element:
 
 
 def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
-    """Reads the vertices. Raises DataError when they end early, or hold what their types can't."""
+    """Reads the vertices, or the Gaussians that SuperSplat packed. Raises DataError when they end early, or hold what their types can't."""
     with path.open("rb") as file:
         order, elements = read_header(path, file)
         unit = _unit(file)
@@ -57,6 +58,13 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
         if place is None:
             raise DataError(f"{path}: no element vertex in its header; expected a point cloud or a mesh")
         vertex, before, behind = elements[place], elements[:place], elements[place + 1 :]
+        if (
+            order
+            and [element.name for element in before] == ["chunk"]
+            and ("packed_position", "u4") in vertex.properties
+        ):
+            chunks, rows = (_read_binary(path, file, order, element, [])[0] for element in (before[0], vertex))
+            return unpack_supersplat(path, chunks, rows, keep)
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
             return replace(cloud_of_columns(path, _read_with_lists(path, vertex), keep), unit=unit)
         if order:

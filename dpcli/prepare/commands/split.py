@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.copy_samples import Copy, copy_samples
 from dpcli.prepare.commands.sources import Source, read_source
-from dpcli.prepare.reader import SPLITS
+from dpcli.prepare.reader import SPLITS, split_called
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.runtime.whole_file import make_folder
@@ -70,8 +70,8 @@ class SplitChoice:
 
 
 def splits_by_list(source: Source, path: Path) -> list[str]:
-    """Returns splits from a CSV of name,split, with or without that header; names of samples that are not there are an
-    error.
+    """Returns splits from a CSV of name,split, with or without that header, those of ours in any spelling; names of samples
+    that are not there are an error.
     """
     try:
         rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
@@ -81,13 +81,13 @@ def splits_by_list(source: Source, path: Path) -> list[str]:
         raise DataError(f"{path}: cannot be read as a CSV table ({error}); expected lines name,split") from None
     chosen: dict[str, str] = {}
     for number, row in enumerate(rows, 1):
-        if row[:2] == ["name", "split"] and number == 1:
+        if [cell.lower() for cell in row[:2]] == ["name", "split"] and number == 1:
             continue
         if len(row) != 2 or not all(row):
             raise DataError(f"{path}, line {number}: found {','.join(row)!r}, expected name,split")
         if row[0] in chosen:
             raise DataError(f"{path}, line {number}: {row[0]!r} is listed twice")
-        chosen[row[0]] = row[1]
+        chosen[row[0]] = split_called(row[1]) or row[1]
     unknown = [name for name in chosen if name not in set(source.names)]
     if unknown:
         raise DataError(f"{path}: {len(unknown)} names are not in {source.path}, the first is {unknown[0]!r}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_npy, read_npz
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.gaussians import read_splat, read_spz
 from dpcli.prepare.cloud_formats.las import read_las
 from dpcli.prepare.cloud_formats.parquet import read_parquet
 from dpcli.prepare.cloud_formats.pcd import read_pcd
@@ -35,6 +36,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".xyzn": read_text,
     ".xyzrgb": read_text,
     ".xyzi": read_text,
+    ".splat": read_splat,
+    ".spz": read_spz,
 }
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 

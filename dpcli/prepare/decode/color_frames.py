@@ -35,7 +35,7 @@ _CAMERAS = (  # of others, in the folder of the images or in the one above
         "poses",
         "poses.txt",
     ),
-    *("transforms.json", "transforms_train.json"),
+    *("transforms.json", "transforms_train.json", "cameras.xml", "cameras.sfm", "cameras.npz", "cameras_sphere.npz"),
 )
 PICTURE_FOLDERS = {
     "ref",

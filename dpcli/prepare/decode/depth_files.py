@@ -380,9 +380,10 @@ def require_depth(path: Path, name: str) -> None:
 
 
 def _is_frame(path: Path) -> bool:
-    """Returns whether an array file holds one frame (H,W), by its header where it has one."""
+    """Returns whether an array file holds one frame, (H,W) or (H,W,1), by its header where it has one."""
     try:
-        return map_npy(path).ndim == 2 if path.suffix.lower() == ".npy" else len(read_array(path)) == 1
+        npy = path.suffix.lower() == ".npy"
+        return map_npy(path).shape[2:] in ((), (1,)) if npy else len(read_array(path)) == 1
     except (DataError, OSError):  # reading the file says so
         return False
 
@@ -404,8 +405,8 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
 
 
 def _as_frames(path: Path, array: np.ndarray, stride: int = 1) -> np.ndarray:
-    if array.ndim == 2:
-        array = array[None]
+    if array.ndim == 2 or array.ndim == 3 and array.shape[2] == 1:  # no picture is one pixel wide
+        array = array.reshape(1, *array.shape[:2])
     if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
         array = array[..., 0] if array.shape[3] == 1 else array[:, 0]
     if array.ndim != 3 or array.dtype.kind not in "uif":

@@ -174,7 +174,7 @@ def _scene_nodes(file: Gltf) -> list[int]:
     order = list(dict.fromkeys(scene.get("nodes", [])))
     for index in order:  # grows while it is walked; circles are refused before
         order += file.item("nodes", index).get("children", [])
-    return order
+    return list(dict.fromkeys(order))  # a scene may list a child of another of its nodes, too
 
 
 def _read_node(file: Gltf, index: int) -> list[_Piece]:
@@ -222,6 +222,8 @@ def _read_skin(file: Gltf, index: int) -> tuple[np.ndarray, np.ndarray]:
         raise file.fail(f"skin {index} has no joints; export the file again")
     if "inverseBindMatrices" not in entry:
         return joints, np.tile(np.eye(4), (len(joints), 1, 1))
+    if len(np.unique(joints)) < len(joints):  # bones are told apart by their nodes
+        raise file.fail(f"skin {index} lists a joint twice; export the file again")
     found = file.accessor(entry["inverseBindMatrices"], f"bones of skin {index}", 16).reshape(-1, 4, 4)
     if len(found) < len(joints):
         raise file.fail(f"skin {index} has {len(found)} bind matrices for {len(joints)} bones; export the file again")

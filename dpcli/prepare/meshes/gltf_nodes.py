@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.errors import UsageError
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.skinning import Curve, matrices
+from dpcli.runtime.progress import log
 
 _REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 _POINTER = re.compile(
@@ -89,6 +90,8 @@ def read_clip(file: Gltf, index: int) -> Clip:
             passed.append(str(path))  # what an extension moves; the specification says to pass it over
             continue
         what = f"clip {name!r}, {path} of {node_name(file, node)!r}"
+        if (node, path) in curves:
+            log.warn(f"{file.path}: {what}: two channels move it, and the last one counts")
         try:
             sampler = entry["samplers"][channel["sampler"]]
             keys = (sampler["input"], sampler["output"], sampler.get("interpolation", "LINEAR"))

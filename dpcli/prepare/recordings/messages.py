@@ -15,6 +15,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, LivoxScan
+from dpcli.prepare.recordings.rvl import unpack_rvl
 
 CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_KINDS)
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -23,7 +24,9 @@ _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 _PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
 _PIXELS |= {"mono8": "u1", "z16": "u2"}
 _JPEG = b"\xff\xd8\xff"
-_DEPTH_HEADER = struct.Struct("<iff")  # before the PNG of image_transport's compressedDepth: format, and two numbers
+_DEPTH_HEADER = struct.Struct(
+    "<iff"
+)  # before what packs the depth, of image_transport's compressedDepth: format, and two numbers
 
 
 def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cloud:
@@ -55,7 +58,11 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     rows = data[: row_step * height].reshape(height, row_step)[:, : width * step]
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
     columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
-    return cloud_of_columns(path, columns, keep)
+    cloud = cloud_of_columns(path, columns, keep)
+    cloud.unread += tuple(
+        field.name for field in content.fields if field.name not in fields
+    )  # of several numbers a point
+    return cloud
 
 
 def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:
@@ -79,16 +86,13 @@ def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:
 
 def _compressed_depth(path: Path, form: str, data: bytes) -> np.ndarray:
     encoding, _, method = (part.strip().lower() for part in form.partition(";"))
-    if "rvl" in method:
-        raise DataError(
-            f"{path}: depth images of {form!r}; expected compressedDepth as PNG, or images that are not compressed"
-        )
     if "compresseddepth" not in method:
         return _decoded(path, form, data)
     if len(data) < _DEPTH_HEADER.size:
         raise DataError(f"{path}: a compressed depth image of {len(data)} bytes; it is damaged")
     _, a, b = _DEPTH_HEADER.unpack_from(data)
-    stored = _decoded(path, form, data[_DEPTH_HEADER.size :])
+    packed = data[_DEPTH_HEADER.size :]
+    stored = unpack_rvl(path, packed) if "rvl" in method else _decoded(path, form, packed)
     if encoding != "32fc1":
         return stored
     with np.errstate(divide="ignore", invalid="ignore"):  # the inverse of depth was stored, 0 where nothing was seen

@@ -29,6 +29,7 @@ _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
+    " .ksplat .sog .oni .klg"
     " .bag .mcap .db3 .active .bz2 .xz .zst".split()
 )
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
@@ -37,6 +38,8 @@ _ADVICE = {
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
     ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
+    **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
+    **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
     ".e57": "save their points as .ply, such as with CloudCompare",
 }
 

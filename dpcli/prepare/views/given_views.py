@@ -14,8 +14,10 @@ from dpcli.errors import DataError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS
 from dpcli.prepare.decode.color_frames import frame_numbers, image_paths
 from dpcli.prepare.reader import natural_key, require_folder
+from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
+_TURN = 6.29  # a whole turn in radians
 _KEYS = {"azimuth", "elevation", "radius", "fovy", "role"}
 _EXAMPLE = '[{"azimuth": 30, "elevation": 20}, ...] in degrees (also radius, fovy, role: train or test)'
 
@@ -47,7 +49,13 @@ def read_cameras(path: Path, radius: float = DEFAULT_RADIUS, fovy: float = DEFAU
         raise DataError(f"{path}: not readable JSON ({error}); expected {_EXAMPLE}") from None
     if not isinstance(entries, list) or not entries:
         raise DataError(f"{path}: expected a list of cameras, {_EXAMPLE}")
-    return [_camera(path, number, entry, radius, fovy) for number, entry in enumerate(entries)]
+    cameras = [_camera(path, number, entry, radius, fovy) for number, entry in enumerate(entries)]
+    degrees = [float(value) for entry in entries for value in (entry["azimuth"], entry["elevation"])]
+    if len(cameras) > 1 and 0 < max(map(abs, degrees)) <= _TURN and any(not value.is_integer() for value in degrees):
+        log.warn(
+            f"{path}: all angles lie within {max(map(abs, degrees)):.3g} degrees; are they radians? Degrees are expected"
+        )
+    return cameras
 
 
 def _camera(path: Path, number: int, entry: Any, radius: float, fovy: float) -> OrbitCamera:

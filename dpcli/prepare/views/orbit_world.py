@@ -9,11 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.runtime.progress import log
 
 OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits the default camera's picture
 _NEAREST = 1e-6  # of the scene's size: what is nearer lies in a camera
 _SAME, _TURNED = 1e-3, 0.1  # of the scene's size: cameras in one place; and radians: what they are turned by there
 _PARALLEL = 0.01  # how much shorter than 1 the mean of rays is that go one way
+_LEVEL = 0.05  # of the picture's right along the upright: 3 degrees of roll
+_ASKEW = 0.1  # the same at which z can't be the upright of cameras that stand level about another axis
+_CLEAR = 0.3  # how far upwards the pictures' up points in the mean, at least, for its sign to be told
+_AXES = np.eye(3)[[2, 1, 0]]  # z first
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,30 @@ def up_direction(poses: np.ndarray) -> np.ndarray:
         if spread[2] < 0.1 * spread[1] and normal @ mean > 0.5 * np.linalg.norm(mean):
             return normal / np.linalg.norm(normal)
     return mean / np.linalg.norm(mean)
+
+
+def up_of_cameras(name: str, poses: np.ndarray) -> np.ndarray:
+    """Returns the upright f64 (3) of poses world_to_camera f64 (V,4,4), OpenCV axes; the log says where it isn't z.
+
+    Whoever films an object holds the camera level: the right of its pictures is level, and their up points upwards. name:
+    of the file, for the log.
+    """
+    right, up = poses[:, 0, :3], -poses[:, 1, :3]
+    roll, rise = np.abs(right @ _AXES.T).max(0), (up @ _AXES.T).mean(0)
+    if roll[0] <= _ASKEW and rise[0] > -_CLEAR:
+        return _AXES[0]
+    level = [k for k in range(3) if roll[k] <= _LEVEL and abs(rise[k]) >= _CLEAR]
+    if level:  # of two, as where one camera looks along an axis, the one that its pictures' up follows more
+        axis = max(level, key=lambda k: abs(rise[k]))
+        sign = float(np.sign(rise[axis]))
+        log.info(f"{name}: {'-' if sign < 0 else ''}{'zyx'[axis]} is up, as all cameras stand level about it")
+        return sign * _AXES[axis]
+    if (leaning := up.mean(0) @ _AXES[0]) < _CLEAR:
+        log.warn(
+            f"{name}: z is taken for up, as in Blender, though up in the pictures is hardly up in it ({leaning:.2f} in the mean);"
+            ' turn the poses, or name the upright: "up": [x, y, z]'
+        )
+    return _AXES[0]
 
 
 def into_orbit(up: np.ndarray, reference: np.ndarray, center: np.ndarray, radius: float) -> Similarity:

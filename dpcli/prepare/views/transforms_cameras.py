@@ -117,6 +117,25 @@ def read_views(path: Path) -> tuple[list[View], list[float]]:
     return whole, sorted(times)
 
 
+def named_up(path: Path) -> np.ndarray | None:
+    """Returns the unit vector (3) that a file calls up, as those of instant-ngp may; None where none does.
+
+    Raises DataError where that is no direction.
+    """
+    for file in transforms_files(path):
+        if (told := read_json(file).get("up")) is None:
+            continue
+        try:
+            up = np.array(told, np.float64)
+        except (TypeError, ValueError):
+            up = np.zeros(0)
+        length = float(np.linalg.norm(up))
+        if up.shape != (3,) or not 1e-9 < length < np.inf:
+            raise DataError(f"{file}: up {told!r}; expected a direction, three numbers")
+        return up / length
+    return None
+
+
 def _collect(path: Path, role: str, views: dict[bytes, View]) -> None:
     try:
         found = read_json(path)

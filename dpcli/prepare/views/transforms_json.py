@@ -15,15 +15,13 @@ from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
-from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes
+from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_of_cameras
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
-from dpcli.prepare.views.transforms_cameras import View, read_views, transforms_files
+from dpcli.prepare.views.transforms_cameras import View, named_up, read_views, transforms_files
 from dpcli.prepare.views.video import VideoOptions, spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
-
-_UP = np.array([0.0, 0.0, 1.0])  # Blender's world
 
 
 def is_transforms(path: Path) -> bool:
@@ -57,8 +55,9 @@ def _check(options: VideoOptions) -> None:
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     """Reads all still cameras of the folder over the times they share; the first training camera is the reference.
 
-    The world is turned (z up becomes y up, the reference to azimuth 0) and scaled so that the object's silhouettes fit
-    a sphere of radius 0.75 around the origin; cameras follow exactly. No crop: only padded to a square and resized.
+    The world is turned (its upright, z as in Blender unless the file or the cameras tell another, becomes y, the
+    reference goes to azimuth 0) and scaled so that the object's silhouettes fit a sphere of radius 0.75 around the
+    origin; cameras follow exactly. No crop: only padded to a square and resized.
     """
     _check(options)
     views, times = read_views(path)
@@ -67,8 +66,9 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([view.intrinsics(*size) for view, size in zip(views, sizes, strict=True)])
     poses = np.stack([view.pose for view in views])
+    up = up_of_cameras(str(path), poses) if (named := named_up(path)) is None else named
     try:
-        world = into_orbit(_UP, poses[0], *sphere_of_silhouettes(intrinsics, poses, list(boxes)))
+        world = into_orbit(up, poses[0], *sphere_of_silhouettes(intrinsics, poses, list(boxes)))
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
     poses = np.stack([world.pose(pose) for pose in poses])

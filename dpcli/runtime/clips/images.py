@@ -30,6 +30,7 @@ _WEBP_FLAGS, _MOVES, _ALPHA = 20, 2, 16  # the byte of flags in an extended WebP
 _EXTRA_SAMPLES = 338  # a tag of TIFF
 _SAID: set[str] = set()
 _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
+_PLANES, _APART = 284, 2  # the same: whether the channels lie one after the other
 _OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
 
@@ -59,12 +60,27 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
         opened = Image.open(_with_alpha_of_webp(path) or path)
     except Image.DecompressionBombError as error:
         raise DataError(f"{path}: not a picture of plausible size ({error}); export it smaller") from None
+    if opened.format == "TIFF" and opened.tag_v2.get(_PLANES) == _APART:
+        opened.close()
+        opened = _open_by_libtiff(path)
     with opened as image:
         require_plausible(path, *image.size, path.stat().st_size)
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
         _tell_unread_channel(path, image)
         yield image
+
+
+def _open_by_libtiff(path: Path):  # -> PIL.Image.Image
+    """Opens a TIFF whose channels lie one after the other: Pillow reads those of 16 bits by itself as if they had 8."""
+    from PIL import Image, TiffImagePlugin, features
+
+    before = TiffImagePlugin.READ_LIBTIFF
+    TiffImagePlugin.READ_LIBTIFF = before or features.check("libtiff")
+    try:
+        return Image.open(path)
+    finally:
+        TiffImagePlugin.READ_LIBTIFF = before
 
 
 def _with_alpha_of_webp(path: Path) -> BytesIO | None:

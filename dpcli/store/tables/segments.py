@@ -100,8 +100,11 @@ def read_segments(path: str | Path, text: str | None = None) -> Segments:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text("utf-8-sig")
-    except UnicodeDecodeError:
+        text = path.read_text("utf-8-sig")
+        if "\0" in text:
+            raise UnicodeError
+        return text
+    except UnicodeError:
         raise DataError(f"{path}: no text; expected segments as .csv or .json") from None
     except OSError as error:
         raise DataError(f"{path}: can't be read ({error.strerror})") from None
@@ -116,13 +119,21 @@ def _json_of(path: str | Path, text: str) -> Mapping[str, Any]:
 
 
 def _csv_rows(path: str | Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
-    """Returns the rows of a CSV table, each with its line in words."""
-    reader = csv.DictReader(io.StringIO(text))
+    """Returns the rows of a CSV table, divided by commas, semicolons or tabs, each with its line in words."""
+    first = text.partition("\n")[0]
+    divider = next((mark for mark in ",;\t" if mark in first), ",")
+    reader = csv.DictReader(io.StringIO(text), delimiter=divider, skipinitialspace=True)
     try:
-        _check_columns(path, reader.fieldnames or [])
-        return [(f"line {reader.line_num}", row) for row in reader]
+        columns = [name.strip().lower() for name in reader.fieldnames or []]
+        _check_columns(path, columns)
+        reader.fieldnames = columns
+        rows = [(f"line {reader.line_num}", row) for row in reader]
     except csv.Error as error:
         raise DataError(f"{path}: line {reader.line_num}: damaged CSV ({error})") from None
+    for where, row in rows:
+        if any(row.pop(None, [])):  # type: ignore[call-overload]  # cells behind the last column
+            raise DataError(f"{path}: {where}: more cells than the {len(columns)} columns; quote a class with a comma")
+    return rows
 
 
 def _check_columns(path: str | Path, columns: Sequence[str]) -> None:

@@ -464,8 +464,17 @@ def test_capsules_are_drawn_and_odd_collisions_passed_over(tmp_path):
 def test_a_folder_of_other_robot_formats_names_one(tmp_path):
     (tmp_path / "urdf").mkdir()
     (tmp_path / "urdf" / "arm.urdf.xacro").write_text("<robot/>")
-    with pytest.raises(DataError, match="no URDF found .urdf/arm.urdf.xacro is none; xacro makes a URDF"):
+    with pytest.raises(DataError, match="no URDF found .urdf/arm.urdf.xacro is none; xacro FILE > robot.urdf"):
         find_objects(tmp_path)
+
+
+def test_a_mesh_named_by_a_file_address_is_opened_where_that_is_allowed(tmp_path):
+    (tmp_path / "cube.obj").write_text(CUBE_OBJ)
+    shape = f'<mesh filename="file://{tmp_path}/cube.obj"/>'
+    path = write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), link("b", shape), joint("j", "a", "b"))
+    assert len(load(path).triangles) == 24
+    assert "only files in it are opened" in Sapien(path).items()[0].problem
+    assert not Sapien(path, allow_outside=True).items()[0].problem
 
 
 def test_names_of_ros_packages_and_of_browsers(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -195,3 +197,30 @@ def test_an_archive_whose_members_would_begin_before_the_file_is_damaged(tmp_pat
     (tmp_path / "a.npz").write_bytes(data)
     with pytest.raises(DataError, match="a.npz: damaged.*Invalid argument"):
         read_npz(tmp_path / "a.npz")
+
+
+@given(st.integers(3, 40), st.integers(4, 7), st.sampled_from([0, 1]), st.integers(0, 2**32 - 1))
+def test_a_first_column_that_counts_the_rows_is_no_axis(rows, columns, start, seed):
+    points = np.random.default_rng(seed).uniform(0.1, 0.9, (rows, columns))
+    assert np.array_equal(saved(points).points, points[:, :3])
+    numbered = points.copy()
+    numbered[:, 0] = np.arange(rows) + start
+    found = saved(numbered)
+    assert np.array_equal(found.points, points[:, 1:4]) and "numbers of the rows" in found.unread[0]
+    assert np.array_equal(saved(np.floor(numbered)).points, np.floor(numbered)[:, :3])  # a grid of whole numbers
+
+
+def saved(array: np.ndarray):
+    with TemporaryDirectory() as folder:
+        np.save(Path(folder) / "p.npy", array)
+        return read_npy(Path(folder) / "p.npy")
+
+
+@pytest.mark.parametrize("corners", ["faces", "triangles", "edges", "indices"])
+def test_the_corners_of_a_mesh_are_no_points(tmp_path, corners):
+    points, faces = np.random.default_rng(0).normal(size=(9, 3)), np.arange(12).reshape(4, 3)
+    np.savez(tmp_path / "m.npz", verts=points, **{corners: faces})
+    assert np.array_equal(read_npz(tmp_path / "m.npz").points, points)
+    np.savez(tmp_path / "n.npz", **{corners: faces})
+    with pytest.raises(DataError, match="expected one called points"):
+        read_npz(tmp_path / "n.npz")

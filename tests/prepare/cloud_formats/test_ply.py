@@ -114,3 +114,21 @@ def test_a_text_that_ends_early_and_not_a_number(tmp_path):
     with pytest.raises(DataError, match="says 5 points, it has room for 2"):
         read_text(tmp_path / "a.ply", ["1 2 3", "4 5 6"], count=5)
     assert np.isnan(read_text(tmp_path / "a.ply", ["nan 2 3", "-1.#IND 5 6"]).points[:, 0]).all()
+
+
+@quick
+@given(degree=st.integers(0, 3), kind=st.sampled_from(["f4", "f8"]), data=st.data())
+def test_gaussians_of_any_layout_bring_their_color(tmp_path, degree, kind, data):
+    rest = [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
+    dc = [f"f_dc_{k}" for k in range(3)]
+    names = data.draw(st.permutations(["x", "y", "z", "opacity", "rot_0", "scale_0", *dc, *rest]))
+    color = data.draw(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3))
+    rows = np.zeros(3, [(name, kind) for name in names])
+    for k in range(3):
+        rows["xyz"[k]] = [point[k] for point in POINTS]
+        rows[dc[k]] = [(one[k] / 255 - 0.5) / (0.5 / np.sqrt(np.pi)) for one in color]
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
+    cloud = read_ply(tmp_path / "a.ply")
+    assert cloud.color.tolist() == [list(one) for one in color]
+    np.testing.assert_allclose(cloud.points, POINTS, rtol=1e-6)
+    assert set(cloud.unread) == {"opacity", "rot_0", "scale_0", *rest}

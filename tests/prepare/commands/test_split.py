@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.commands.sources import read_source
 from dpcli.prepare.commands.split import SplitChoice, draw_splits, split, splits_by_list
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import dpc
@@ -63,6 +64,14 @@ def test_by_subject(whole, tmp_path):
         split(whole, tmp_path / "e", SplitChoice(subjects={"train": (1, 9)}))
     with pytest.raises(UsageError, match="subject 1 is to be train and validation"):
         split(whole, tmp_path / "e", SplitChoice(subjects={"train": (1,), "validation": (1,)}))
+
+
+@pytest.mark.parametrize(
+    ("word", "split"), [("Training", "train"), ("VAL", "validation"), ("test set", "test"), ("odd", "odd")]
+)
+def test_a_list_may_spell_our_splits_in_its_own_way(tmp_path, whole, word, split):
+    (tmp_path / "list.csv").write_text(f"Name,Split\ns03,{word}\n")
+    assert splits_by_list(read_source(whole), tmp_path / "list.csv") == ["", "", "", split, *[""] * 8]
 
 
 def test_by_list(whole, tmp_path):

@@ -140,6 +140,16 @@ def test_pictures_that_opencv_would_change_are_refused(tmp_path):
         read_frame(tmp_path / "b.png")
 
 
+@pytest.mark.parametrize("shape", [(6, 8), (1, 6, 8), (6, 8, 1), (1, 6, 8, 1), (1, 1, 6, 8)])
+def test_one_frame_of_any_shape_is_one(tmp_path, shape):
+    frames = np.arange(3 * 48, dtype=np.uint16).reshape(3, 6, 8) + 500
+    for k, frame in enumerate(frames):
+        np.save(tmp_path / f"{k}.npy", frame.reshape(shape))
+        np.testing.assert_array_equal(read_array(tmp_path / f"{k}.npy"), frame[None])
+    if shape in ((6, 8), (6, 8, 1)):  # as the frames of a folder; others may be videos of one frame
+        np.testing.assert_array_equal(read_depth_video(tmp_path).frames, frames)
+
+
 @pytest.mark.parametrize("shape", [(48, 80, 6), (480, 640, 300), (424, 512, 100)])
 def test_an_array_whose_frames_come_last_is_refused(tmp_path, shape):
     np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint16, shape)  # a sparse file, which is not read

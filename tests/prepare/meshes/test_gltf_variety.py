@@ -23,7 +23,7 @@ from dpcli.prepare.meshes.filming import Filming, film, ground_truth
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.skinning import Curve
 from tests.prepare.meshes.test_animation import look
-from tests.support.gltf_files import GlbFile, quad
+from tests.support.gltf_files import GlbFile, arm, quad
 
 SMALL = Filming(size=48, test_azimuths=(60.0,), tracks=300, shading=0.0)
 BLUE = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}, "doubleSided": True}
@@ -450,6 +450,24 @@ def test_what_is_left_out_is_named(tmp_path, capsys, change, words):
     pieces.append({**pieces[0], **change})
     load(file, tmp_path)
     assert words in capsys.readouterr().err
+
+
+def test_what_two_of_the_file_say_of_one_thing_is_told(tmp_path, capsys):
+    file = arm()
+    file.tree["skins"][0]["joints"] = [1, 1]
+    with pytest.raises(DataError, match="skin 0 lists a joint twice"):
+        load(file, tmp_path)
+    file = quad(1)
+    file.animate(0, "translation", [0, 1], [[0, 0, 0], [0, 1, 0]])
+    load(file, tmp_path)
+    assert "translation of 'square': two channels move it" in capsys.readouterr().err
+
+
+def test_a_child_that_its_scene_lists_too_is_drawn_once(tmp_path):
+    file = quad(1)
+    file.tree["nodes"].append({"children": [0]})
+    file.tree["scenes"] = [{"nodes": [1, 0]}]
+    assert len(load(file, tmp_path).triangles) == 2
 
 
 # normals and keys

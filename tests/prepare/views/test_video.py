@@ -9,14 +9,17 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
+from dpcli.prepare.views.given_views import read_cameras
+from dpcli.prepare.views.orbit_world import up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
@@ -478,6 +481,15 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
 
 
+@pytest.mark.parametrize("scale, told", [(np.pi / 180, True), (1, False)])
+def test_cameras_in_radians_are_told(tmp_path, capfd, scale, told):
+    angles = [(0, 10), (90, 10), (200, -20)]
+    entries = [{"azimuth": scale * azimuth, "elevation": scale * elevation} for azimuth, elevation in angles]
+    (tmp_path / "c.json").write_text(json.dumps(entries))
+    read_cameras(tmp_path / "c.json")
+    assert ("are they radians?" in capfd.readouterr().err) == told
+
+
 def test_views_belong_to_the_frames_that_are_used(tmp_path):
     folder = save(tmp_path / "ref", moving(6))
     clip = video_clip(folder, VideoOptions(frames=3, size=32, views=six(tmp_path / "views", range(6))))
@@ -711,6 +723,55 @@ def test_bad_transforms(tmp_path, change, message):
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
         transforms_clip(folder, SMALL)
+
+
+def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
+    """World_to_camera, OpenCV axes, of cameras at (azimuth, elevation) held level in a world of z up, which `turn` turns."""
+    poses = []
+    for azimuth, elevation in angles:
+        back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([turn @ right, turn @ -np.cross(back, right), turn @ -back, 3 * turn @ back])
+        poses.append(np.linalg.inv(pose))
+    return np.array(poses)
+
+
+@given(
+    st.lists(st.tuples(st.one_of(st.floats(0, 6), st.just(0.0)), st.floats(-0.5, 0.7)), min_size=1, max_size=6),
+    st.permutations([0, 1, 2]),
+    st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3),
+)
+def test_the_upright_is_the_axis_about_which_cameras_stand_level(angles, order, signs):
+    turn = np.eye(3)[order] * np.array(signs)[:, None]
+    turn = turn * np.linalg.det(turn)  # no mirror
+    poses, up = level_cameras(angles, turn), turn @ [0, 0, 1]
+    assume(up[2] or np.abs(poses[:, 0, 2]).max() > 0.11)  # else they may look down in a world of z up
+    np.testing.assert_allclose(up_of_cameras("a", poses), up, atol=1e-9)
+
+
+def test_cameras_from_straight_above_and_rolled_ones_leave_z_up(capsys):
+    above = level_cameras([(0.0, np.pi / 2), (1.0, np.pi / 2)], np.eye(3))
+    assert up_of_cameras("a", above).tolist() == [0, 0, 1] and not capsys.readouterr().err
+    spin = Rotation.from_euler("zyx", [0.7, 1.3, -0.4]).as_matrix()
+    assert up_of_cameras("a", level_cameras([(0, 0.2), (2, 0.3)], spin)).tolist() == [0, 0, 1]
+    assert "z is taken for up" in capsys.readouterr().err
+
+
+def test_an_upright_that_the_file_names_counts(tmp_path):
+    folder, poses = blender_folder(tmp_path / "scene")
+    plain = transforms_clip(folder, VideoOptions(size=64)).header.world_to_camera
+    data = json.loads((folder / "transforms_train.json").read_text())
+    spin = np.eye(4)
+    spin[:3, :3] = Rotation.from_euler("zyx", [0.7, 0.3, -0.4]).as_matrix()
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (spin @ frame["transform_matrix"]).tolist()
+    data["up"] = (2 * spin[:3, 2]).tolist()
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    np.testing.assert_allclose(transforms_clip(folder, VideoOptions(size=64)).header.world_to_camera, plain, atol=1e-6)
+    (folder / "transforms_train.json").write_text(json.dumps(data | {"up": "y"}))
+    with pytest.raises(DataError, match="up 'y'; expected a direction"):
+        transforms_clip(folder, VideoOptions(size=64))
 
 
 def test_inverted_poses_are_noticed(tmp_path):

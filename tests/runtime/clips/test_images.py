@@ -15,6 +15,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
 from dpcli.prepare.views.masks import read_mask
+from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.name_numbers import in_order
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -249,3 +250,38 @@ def test_files_of_several_pictures_are_no_frames(tmp_path, kind):
             DataError, match=f"0.{kind}: 3 pictures in one file; an animation is a clip itself, name it"
         ):
             read()
+
+
+def tiff_of_planes(pixels: np.ndarray, order: str, alpha: int) -> bytes:
+    """A TIFF of pixels (H,W,C), u1 or u2, whose channels lie one after the other; alpha: 1 associated, 2 not, of four."""
+    height, width, count = pixels.shape
+    planes = [pixels[..., k].astype(pixels.dtype.newbyteorder(order)).tobytes() for k in range(count)]
+    tags = [(256, [width]), (257, [height]), (258, [8 * pixels.itemsize] * count), (259, [1]), (262, [2])]
+    starts = [8 + len(planes[0]) * k for k in range(count)]
+    tags += [(273, starts), (277, [count]), (278, [height]), (279, [len(planes[0])] * count), (284, [2])]
+    tags += [(338, [alpha])] * (count == 4)
+    at = 8 + sum(map(len, planes))
+    far, head = at + 2 + 12 * len(tags) + 4, struct.pack(order + "H", len(tags))
+    lists = b""
+    for tag, values in tags:
+        whole = struct.pack(f"{order}{len(values)}I", *values)
+        head += struct.pack(order + "HHI", tag, 4, len(values))
+        head += whole if len(values) == 1 else struct.pack(order + "I", far + len(lists))
+        lists += whole if len(values) > 1 else b""
+    mark = b"II" if order == "<" else b"MM"
+    return mark + struct.pack(order + "HI", 42, at) + b"".join(planes) + head + bytes(4) + lists
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize(("channels", "alpha"), [(3, 0), (4, 1), (4, 2)])
+def test_channels_of_a_tiff_may_lie_one_after_the_other(tmp_path, order, kind, channels, alpha):
+    straight = np.random.default_rng(0).integers(40, 256, (9, 13, channels))
+    stored = straight.astype(float)
+    if alpha == 1:
+        stored[..., :3] *= stored[..., 3:] / 255
+    stored = np.round(stored * (257 if kind == "u2" else 1)).astype(kind)
+    (tmp_path / "a.tif").write_bytes(tiff_of_planes(stored, order, alpha))
+    with open_image(tmp_path / "a.tif") as image:
+        found = np.asarray(as_shown(image).convert("RGBA")).astype(int)
+    np.testing.assert_allclose(found[..., :channels], straight, atol=6 if alpha == 1 else 1)

@@ -19,6 +19,7 @@ from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
+_BELOW = -0.1  # of floats in 0..1: an overshoot is no lower, and where black is -1 dark pixels are
 _ALL = "compare all with those of the same names in a folder TRUTH"
 
 
@@ -42,6 +43,7 @@ class FolderSource(Source):
         self.files = list(folders.values())
         self.views = [_view_of_folder("" if folder == path else folder.name) for folder in folders]
         self.frames = [len(files) for files in self.files]
+        self.numbers = [_counted(files) for files in self.files]
         self.has_alpha = _read_image(self.files[0][0])[1]
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
@@ -59,6 +61,15 @@ def _numbers_in_name(path: Path) -> tuple:
     return [int(number) for number in re.findall(r"\d+", path.stem)], path.name
 
 
+def _counted(files: Sequence[Path]) -> list[int] | None:
+    """Returns the only number that differs among the names of files, of each; None where several do, or none."""
+    rows = [_numbers_in_name(file)[0] for file in files]
+    if len({len(row) for row in rows}) != 1:
+        return None
+    varying = [list(column) for column in zip(*rows) if len(set(column)) > 1]
+    return varying[0] if len(varying) == 1 else None
+
+
 def _view_of_folder(name: str) -> View:
     """Returns the view that a folder's name stands for.
 
@@ -67,7 +78,7 @@ def _view_of_folder(name: str) -> View:
     if name.lower() in ("", "reference", "ref", "input"):
         return View(tuple(dict.fromkeys([name.lower() or "reference", "reference"])), "reference")
     number = re.fullmatch(r"(?:view|cam|camera)?[-_]?(\d+)", name.lower())
-    return View((name, *([str(int(number[1]))] if number and number[1] != name else ())), "test")
+    return View((name, *([str(int(number[1]))] if number and str(int(number[1])) != name else ())), "test")
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, bool]:
@@ -120,6 +131,12 @@ class ArraySource(Source):
                 raise DataError(
                     f"{self.path}: frame {frame} has values up to {largest:g}; floats are taken as 0..1: "
                     "divide by 255, or store them as uint8"
+                )
+            smallest = float(np.nanmin(values[..., :3], initial=0))
+            if -np.inf < smallest < _BELOW:
+                raise DataError(
+                    f"{self.path}: frame {frame} has values down to {smallest:g}; floats are taken as 0..1: of -1..1 save "
+                    "(x + 1) / 2"
                 )
             with np.errstate(invalid="ignore"):  # NaN is found, and said, by whoever compares
                 colored = values[..., :3] * values[..., 3:]

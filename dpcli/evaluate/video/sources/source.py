@@ -74,7 +74,8 @@ class Source(ABC):
     """Gives the videos of one object. `pictures` reads the frames of a view in rising order, one in memory at a time.
 
     frames: of each view, None = any (a scene can be seen at any time). has_alpha: whether the object is cut out.
-    rate: frames a second in the mean, None where it isn't known.
+    rate: frames a second in the mean, None where it isn't known. numbers: those in the names of each view's frames, None
+    where names have none, or several.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class Source(ABC):
     frames: list[int] | None
     has_alpha: bool = True
     rate: float | None = None
+    numbers: Sequence[Sequence[int] | None] | None = None
     header: ViewsHeader | None = None
     history: list[dict] = []
 

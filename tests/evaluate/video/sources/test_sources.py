@@ -101,6 +101,42 @@ def test_clips_of_other_rates_are_told(tmp_path: Path) -> None:
     assert "The prediction plays 25 frames a second, the truth 10: compared by their number." in report.notes
 
 
+@pytest.mark.parametrize(
+    ("ours", "theirs", "told"),
+    [
+        ([0, 1, 2, 3], [5, 6, 7, 8], ""),
+        ([0, 10, 20, 30], [100, 110, 120, 130], ""),
+        ([0, 1, 3, 4], [0, 1, 2, 3], "3 with 2"),
+        ([0, 2, 4, 6], [0, 1, 2, 3], "2 with 1"),
+    ],
+)
+def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list, theirs: list, told: str) -> None:
+    for folder, own in (("a", ours), ("b", theirs)):
+        (tmp_path / folder).mkdir()
+        for number in own:
+            Image.new("RGB", (16, 16), (number, 0, 0)).save(tmp_path / folder / f"v2_{number:04}_rgba.png")
+    notes = " ".join(evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",)).notes)
+    assert (f"({told})" in notes) if told else "number them otherwise" not in notes
+
+
+@pytest.mark.parametrize("digits", [1, 2, 5])
+def test_views_of_any_number_of_digits_are_the_same(tmp_path: Path, digits: int) -> None:
+    for view in range(11):
+        write_folder(tmp_path / "a" / f"{view:0{digits}}", clip(1, views=1)[0])
+        write_folder(tmp_path / "b" / f"cam{view}", clip(1, views=1)[0])
+    assert len(evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",)).views) == 11
+
+
+def test_floats_about_zero_are_refused(tmp_path: Path) -> None:
+    pictures = np.random.default_rng(0).random((3, 16, 16, 3), np.float32)
+    np.save(tmp_path / "truth.npy", pictures)
+    np.save(tmp_path / "sharpened.npy", pictures * 1.1 - 0.05)  # overshoots a little
+    assert evaluate_video(tmp_path / "sharpened.npy", tmp_path / "truth.npy", metrics=("psnr",)).views
+    np.save(tmp_path / "model.npy", 2 * pictures - 1)
+    with pytest.raises(DataError, match=r"frame 0 has values down to -.*save \(x \+ 1\) / 2"):
+        evaluate_video(tmp_path / "model.npy", tmp_path / "truth.npy", metrics=("psnr",))
+
+
 def test_a_folder_of_videos_lists_them(tmp_path: Path, capsys) -> None:
     """The loop of the advice names all of them, and images beside a video are compared alone."""
     folder = tmp_path / "my clips"

@@ -1,0 +1,24 @@
+"""What counts where no split was asked for."""
+
+from __future__ import annotations
+
+import pytest
+
+from dpcli.evaluate.results import tell_split
+
+
+@pytest.mark.parametrize(
+    ("split", "splits", "told"),
+    [
+        (None, ["train", "Test"], True),
+        (None, ["train", "validation", ""], True),
+        ("all", ["train", "Test"], False),
+        ("Test", ["train", "Test"], False),
+        (None, ["train", "test", "probe"], False),
+        (None, ["train", "train"], False),
+        (None, ["", ""], False),
+    ],
+)
+def test_training_samples_that_count_beside_others_are_told(capsys, split, splits, told):
+    tell_split("a.h5", split, splits)
+    assert ("those of 'train', too" in capsys.readouterr().err) == told

@@ -1,0 +1,123 @@
+"""Tables of labels and folders of classes in the spellings of other programs; what can't be known is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.labels import labels_of_folders, read_labels
+from dpcli.prepare.reader import SPLITS, split_called
+
+WORDS = {"train": "train", "Training": "train", "val": "validation", "VALID": "validation", "testing": "test"}
+AFFIXES = ("{}", "{}_set", "{}set", "{} data", "{}-split", "split_{}", "set.{}", "{}_videos")
+
+
+@given(st.sampled_from(list(WORDS)), st.sampled_from(AFFIXES))
+def test_words_for_splits_are_known_with_what_people_add(word, affix):
+    assert split_called(affix.format(word)) == WORDS[word]
+
+
+@pytest.mark.parametrize(
+    "word", ["dev", "eval", "data", "set", "videos", "trainer", "contest", "attest", "latest data", ""]
+)
+def test_other_words_are_no_splits(word):
+    assert split_called(word) == ""
+
+
+@pytest.mark.parametrize("affix", AFFIXES)
+def test_splits_below_their_classes_are_read(tmp_path, affix):
+    names = [f"{label}/{affix.format(split)}/{k}" for label in ("wave", "bow") for split in WORDS for k in range(2)]
+    table = labels_of_folders(tmp_path, names, "CLASS/VIDEO")
+    assert table.class_names == ["bow", "wave"]
+    for name, row in table.rows.items():
+        label, split, _ = name.split("/")
+        assert table.class_names[row.label] == label
+        assert row.split == WORDS[next(word for word in WORDS if affix.format(word) == split)]
+
+
+@pytest.mark.parametrize(
+    "names", [["wave/train/1", "bow/a/2"], ["wave/train/1", "bow/train/2"], ["wave/train", "bow/test"]]
+)
+def test_a_folder_called_train_alone_makes_no_splits(tmp_path, names):
+    assert {row.split for row in labels_of_folders(tmp_path, names, "CLASS/VIDEO").rows.values()} == {""}
+
+
+@pytest.mark.parametrize("people", [("s1", "s2"), ("subject 01", "subject 12"), ("7", "8")])
+def test_people_above_their_actions_are_told(tmp_path, capsys, people):
+    labels_of_folders(tmp_path, [f"{one}/{label}" for one in people for label in ("wave", "bow")], "CLASS")
+    assert "the folders below are the same in each (bow, wave)" in " ".join(capsys.readouterr().err.split())
+    labels_of_folders(tmp_path, [f"a{label}/{one}" for one in people for label in ("1", "2")], "CLASS")
+    assert not capsys.readouterr().err
+
+
+def table(folder: Path, text: str):
+    (folder / "labels.csv").write_text(text)
+    return read_labels(folder / "labels.csv")
+
+
+@pytest.mark.parametrize("name", ["id", "clip", "Sequence", "file_name", "video_id"])
+@pytest.mark.parametrize("label", ["action", "Gesture", "class_name", "label"])
+def test_headers_of_other_programs_are_read(tmp_path, name, label):
+    header = f"{name},{label},participant,set"
+    read = table(tmp_path, f"{header}\na,wave,s03,Test set\nb,bow,s12,train\n")
+    assert [(one, row.label, row.subject, row.split) for one, row in read.rows.items()] == [
+        ("a", 1, 3, "test"),
+        ("b", 0, 12, "train"),
+    ]
+
+
+def test_a_plain_name_goes_before_one_that_may_mean_the_same(tmp_path, capsys):
+    read = table(tmp_path, "id,name,label,action\n0,a,wave,x\n1,b,bow,y\n")
+    assert list(read.rows) == ["a", "b"] and read.class_names == ["bow", "wave"]
+    assert "columns not read: id, action" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spelled", ["s{:02}", "P{}", "subject_{}", "{}.0", "{:03}"])
+def test_subjects_are_the_numbers_in_their_names(tmp_path, spelled):
+    rows = "".join(f"v{k},wave,{spelled.format(k) if k else ''}\n" for k in (0, 3, 12))
+    assert [row.subject for row in table(tmp_path, "name,label,subject\n" + rows).rows.values()] == [-1, 3, 12]
+
+
+@pytest.mark.parametrize("subjects", [("m1", "f1"), ("anna", "ben"), ("s1", "2"), ("1.5", "2.5")])
+def test_subjects_whose_numbers_may_be_of_two_people_are_refused(tmp_path, subjects):
+    with pytest.raises(DataError, match="expected a whole number"):
+        table(tmp_path, "name,label,subject\n" + "".join(f"v{k},wave,{one}\n" for k, one in enumerate(subjects)))
+
+
+@pytest.mark.parametrize("word", ["dev", "0", "probe"])
+def test_splits_of_other_names_are_told(tmp_path, capsys, word):
+    read = table(tmp_path, f"name,label,split\na,wave,{word}\nb,bow,train\n")
+    assert read.rows["a"].split == word
+    assert f"none of {', '.join(SPLITS)} stay as they are: {word}" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("cell", ["NaN", "null", "#N/A", ""])
+def test_a_cell_without_a_value_is_no_class(tmp_path, cell):
+    with pytest.raises(DataError, match=r"labels\.csv:3"):
+        table(tmp_path, f"name,label\na,wave\nb,{cell}\n")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "told"),
+    [
+        ("two hand wave", "two_hand  Wave", True),
+        ("gr\u00f6\u00dfe", "gro\u0308\u00dfe", True),
+        ("wave1", "wave 1", False),
+        ("a-b", "a b", True),
+    ],
+)
+def test_classes_that_look_alike_are_told(tmp_path, capsys, one, other, told):
+    (tmp_path / "labels.csv").write_text(f"name,label\na,{one}\nb,{other}\n", encoding="utf-8")
+    assert len(read_labels(tmp_path / "labels.csv").class_names) == 2
+    assert ("are different classes" in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize("line", ["sep=;\n", '"sep=;"\r\n', "\ufeffsep=;\n"])
+def test_a_line_that_tells_spreadsheets_the_divider_is_none_of_the_table(tmp_path, line):
+    (tmp_path / "labels.csv").write_text(line + "name;label\na;wave\nb;\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"labels\.csv:4: 'b,'"):
+        read_labels(tmp_path / "labels.csv")
