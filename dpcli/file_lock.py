@@ -15,7 +15,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)  # fil
 def open_alone(path: Path) -> int:
     """Opens and locks a file, made if absent; again if another process finished and removed the file in between.
 
-    Closing the number releases it. DpcError when another process holds the file.
+    Closing the number releases it. Raises DpcError when another process holds the file.
     """
     while True:
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)

@@ -55,7 +55,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_member(path: Path, data: bytes) -> np.ndarray:
-    """Returns the array that the bytes of a `.npy` describe. DataError where its header claims another number of bytes."""
+    """Returns the array that the bytes of a `.npy` describe. Raises DataError where its header claims another size."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -19,7 +19,7 @@ def as_utf8(text: str) -> str:
 
 
 def utf8_path(path: Path, library: str) -> str:
-    """Returns the path for a library that takes only UTF-8 (OpenCV's videos crash otherwise). DataError when it is none."""
+    """Returns a path for a library that takes only UTF-8 (OpenCV's videos crash). Raises DataError when it isn't UTF-8."""
     text = str(path)
     if as_utf8(text) != text:
         raise DataError(

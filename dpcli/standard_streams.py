@@ -73,7 +73,7 @@ def loud_libraries() -> Iterator[None]:
 
 
 class PrintableStream:
-    """A text stream to which nothing goes that would command a terminal, whoever writes it; otherwise as the stream it holds."""
+    """Wraps a text stream so that nothing that commands a terminal reaches it, whoever writes; else acts as that stream."""
 
     def __init__(self, stream: TextIO) -> None:
         self.unfiltered = stream

@@ -18,7 +18,7 @@ _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def read_text(path: Path) -> str:
-    """Returns the text of a file in UTF-8, with or without a byte order mark. DataError when it is in another encoding.
+    """Returns the text of a file in UTF-8, with or without a byte order mark. Raises DataError when it is in another encoding.
 
     Errors of the system (no such file, no permission) pass.
     """
@@ -31,12 +31,12 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Returns what a JSON file says. DataError as `read_text` and `parse_json`."""
+    """Returns what a JSON file says. Raises DataError as `read_text` and `parse_json`."""
     return parse_json(read_text(path), path)
 
 
 def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Returns the mapping of what one in JSON says. ValueError where a key has two values: no one can tell which is meant."""
+    """Returns the mapping of what one in JSON says. Raises ValueError where a key has two values."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
@@ -45,8 +45,9 @@ def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, where: object, as_browsers: bool = False) -> Any:
-    """Returns what JSON text of `where` says. DataError when it is none, too deep, or has half a letter in a string, or two
-    values of one key; of those ``as_browsers`` takes the last.
+    """Returns what JSON text of `where` says. ``as_browsers``: of two values of one key the last counts.
+
+    Raises DataError when it is none, too deep, has half a letter in a string, or two values of one key.
     """
     try:
         if isinstance(text, bytes):

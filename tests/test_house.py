@@ -189,3 +189,65 @@ def test_docstrings_begin_with_a_subject_or_a_verb():
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
                 words = (ast.get_docstring(node) or "").split()
                 assert not words or words[0] not in RELATIVE, f"{name}: {' '.join(words[:8])} ..."
+
+
+# First words that end as a verb does, but are none: the sentences that follow them have no verb.
+NO_VERBS = set(
+    "As Axes Blocks Bodies Cells Centroids Class Coefficients Columns Distances Features Frames Gradients Indices Inverses Its"
+    " Joints Layers Masks Matrices Means Messages Neighborhoods Pieces Points Ranges Rows Statistics Swatches This Values"
+    " Vertices Weights".split()
+)
+# Docstrings that are whole sentences with a subject of their own: errors, which say what happened.
+OWN_SUBJECT = {
+    "dpcli.errors.DpcError",
+    "dpcli.errors.UsageError",
+    "dpcli.errors.DataError",
+    "dpcli.errors.Stopped",
+    "dpcli.runtime.pool.LostWorker",
+    "dpcli.store.writing.journal._Changed",
+}
+
+
+def begins_with_a_verb(docstring: str) -> bool:
+    """Whether the first word is a verb in the third person, as in "Returns the ..."; the class or function is its subject."""
+    word = docstring.split()[0].rstrip(",.:")
+    return word.istitle() and word.isalpha() and word.endswith("s") and word not in NO_VERBS
+
+
+def described(node: ast.AST, name: str) -> Iterator[tuple[str, str]]:
+    """The names and docstrings of all classes and functions below a node; those of commands are their help and are left out."""
+    for child in ast.iter_child_nodes(node):
+        own = isinstance(child, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+        below = f"{name}.{child.name}" if own else name
+        if own and child.name != "main" and (docstring := ast.get_docstring(child)):
+            yield below, docstring
+        yield from described(child, below)
+
+
+def test_docstrings_are_sentences():
+    """Those of `dpcli.cli` are help texts, which are imperative by custom."""
+    found = {
+        name: docstring.split("\n")[0]
+        for module, path in MODULES.items()
+        if not module.startswith("dpcli.cli.")
+        for name, docstring in described(ast.parse(path.read_text()), module)
+        if not begins_with_a_verb(docstring)
+    }
+    assert {name: line for name, line in found.items() if name not in OWN_SUBJECT} == {}
+    assert OWN_SUBJECT <= set(found), "an exception that is needed no more"
+
+
+@pytest.mark.parametrize(
+    "docstring",
+    [
+        "Return the rows.",
+        "The gradient of the rows.",
+        "(R,) squared radii.",
+        "Class logits (B,C).",
+        "out[r] = max(x, 0)",
+    ],
+)
+def test_what_is_no_sentence_is_found(docstring):
+    tree = ast.parse(f"def f():\n    {docstring!r}\n")
+    assert [begins_with_a_verb(text) for _, text in described(tree, "m")] == [False]
+    assert begins_with_a_verb("Returns the rows.")

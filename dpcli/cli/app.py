@@ -65,7 +65,7 @@ def _root(
 
 
 def application(words: Sequence[str] | None = None) -> typer.Typer:
-    """`dpc` with the one command that the words name set up and the other rooms by name only; with all of it for None."""
+    """Returns `dpc` with the command that the words name set up and the other groups by name only; with all of it for None."""
     dpc = typer.Typer(
         name="dpc",
         cls=SectionedGroup,
@@ -109,7 +109,7 @@ def __getattr__(name: str) -> typer.Typer:
 
 
 def _global_flags(argv: list[str]) -> list[str]:
-    """Take -q, -v and --debug out of the arguments, wherever they stand (before a bare `--`)."""
+    """Takes -q, -v and --debug out of the arguments, wherever they stand (before a bare `--`)."""
     from dpcli.runtime.progress import log
 
     end = argv.index("--") if "--" in argv else len(argv)
@@ -123,7 +123,7 @@ def _global_flags(argv: list[str]) -> list[str]:
 
 
 def _explain(error: BaseException) -> int:
-    """Print a message for a person and return the exit code."""
+    """Prints a message for a person and returns the exit code."""
     from dpcli.runtime.progress import log
     from dpcli.runtime.whole_file import disk_full
 
@@ -173,10 +173,9 @@ def _check_value(value: Any, option: Any) -> None:
 
 
 def _checking_values(command: Any) -> Any:
-    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default, and where
-    nobody may read a path.
+    """Makes the command, or all below it, end where an option is nan or too large for float32, or a path is unreadable.
 
-    Where memory ends, options far above their defaults are named.
+    A value that is so by default passes. Where memory ends, options far above their defaults are named.
     """
     for below in getattr(command, "commands", {}).values():
         _checking_values(below)
@@ -201,7 +200,7 @@ def _checking_values(command: Any) -> Any:
 
 
 def _keeping_inputs(command: Any) -> Any:
-    """The command, or all below it, ending where it would write what it reads, no regular file, or where nobody may."""
+    """Makes the command, or all below it, end where it would write what it reads, no regular file, or where nobody may."""
     for below in getattr(command, "commands", {}).values():
         _keeping_inputs(below)
     run = command.callback

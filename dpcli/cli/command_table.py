@@ -15,7 +15,7 @@ from dpcli.cli.option_groups import with_option_groups
 
 @dataclass(frozen=True)
 class Group:
-    """The commands of a package, and groups below it.
+    """Holds the commands of a package, and groups below it.
 
     package: where the modules of the commands are. sections: heading in the help, "" for none -> commands, each as its
     module, whose last part is also the function, or as "module:function". groups: name -> group. heading, about: what the

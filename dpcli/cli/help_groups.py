@@ -14,7 +14,7 @@ LABELS = "Labels and splits"
 
 
 class SectionedGroup(TyperGroup):
-    """A group whose help prints its commands in sections, with descriptions that wrap instead of being cut.
+    """Prints, as the help of a group, its commands in sections, with descriptions that wrap instead of being cut.
 
     The heading of a command is its ``rich_help_panel``; without one it stands under "Commands".
     """
@@ -32,7 +32,7 @@ class SectionedGroup(TyperGroup):
 
 
 class SectionedCommand(TyperCommand):
-    """A command whose help prints its arguments and own options, then those under other headings, those of the run last.
+    """Prints, as the help of a command, its arguments and own options, then those under other headings, those of the run last.
 
     The heading of an option is its ``rich_help_panel``; without one it stands under "Options".
     """

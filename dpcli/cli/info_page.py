@@ -31,10 +31,11 @@ def write_info_page(
     chosen: Sequence[str],
     view: str | None,
 ) -> list[str]:
-    """Write a page about the file of a kind; return what it leaves out, in sentences.
+    """Writes a page about the file of a kind and returns what it leaves out, in sentences.
 
     rows: facts (name, value) for its panel. samples: most sequences of a page of clouds. chosen: only these sequences, by name or
-    number. view: axes that point right, down and away. UsageError for a wrong choice, DataError when the page can't be written.
+    number. view: axes that point right, down and away. Raises UsageError for a wrong choice, DataError when the
+    page can't be written.
     """
     from dpcli.draw.page.assemble import write_page
     from dpcli.runtime.whole_file import check_target
@@ -94,7 +95,7 @@ def _short_unit(unit: str) -> str:
 
 
 def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[int]:
-    """Return the sequences to show: those named (by name, else by number), else some of each class."""
+    """Returns the sequences to show: those named (by name, else by number), else some of each class."""
     from dpcli.draw.clouds_sheet import spread_samples
     from dpcli.errors import DataError
 
@@ -117,7 +118,7 @@ def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[i
 
 
 def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes: np.ndarray) -> PageSequence:
-    """Read a sequence one frame at a time and keep `most` points of each."""
+    """Reads a sequence one frame at a time and keeps `most` points of each."""
     from dpcli.draw.page.points import PageSequence, spread
 
     fields = [name for name in ("part", "color", "time") if name in reader.fields]
@@ -158,7 +159,7 @@ def _many(count: int, word: str) -> str:
 
 
 def _left_out(reader: CloudsReader, frames: dict[int, list[int]], most: int, chosen: bool) -> list[str]:
-    """Return sentences about the sequences, frames and points of the file that the page doesn't show."""
+    """Returns sentences about the sequences, frames and points of the file that the page doesn't show."""
     notes = []
     if len(frames) < len(reader):
         how = "" if chosen else "; --samples N or --sequence NAME shows others"

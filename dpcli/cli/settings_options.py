@@ -30,7 +30,7 @@ Presets = Mapping[str, Mapping[str, Any]]  # preset -> group -> instance
 def options_of(
     catalog: Catalog, everyday: Sequence[str] = (), *, presets: Presets | None = None, preset: str | None = None
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that gives a command the options of its settings in place of its parameter of type `Given`.
+    """Returns a decorator that gives a command the options of its settings in place of its parameter of type `Given`.
 
     everyday: public names of the settings that get flags of their own; all others are reached by `--set` and `--config`.
     presets: the presets that `--preset` chooses from, with an instance for each group. preset: the name of the default one.
@@ -67,7 +67,7 @@ def options_of(
 
 
 def _take(catalog: Catalog, everyday: Sequence[str], values: dict[str, Any]) -> Given:
-    """Take the settings' options out of a command's values."""
+    """Takes the settings' options out of a command's values."""
     values.pop("help_all", None)
     preset, config, sets = values.pop("preset_name", None), values.pop("config_file"), values.pop("set_values")
     flags = {name: values.pop(name) for name in everyday}
@@ -92,7 +92,7 @@ def _preset_option(presets: Presets, default: str | None) -> list[inspect.Parame
 
 
 def _flag(one: Setting, default: str) -> inspect.Parameter:
-    """Return an option that is None unless given; a number or word is read by the setting itself, with its own errors."""
+    """Returns an option that is None unless given; a number or word is read by the setting itself, with its own errors."""
     option, inner = f"--{one.name.replace('_', '-')}", without_none(one.hint)
     extra = "; ".join(part for part in (f"default: {default}", one.bounds) if part)
     about = f"{one.help}  [{extra}]"
@@ -143,7 +143,7 @@ def _general_options(catalog: Catalog, presets: Presets) -> list[inspect.Paramet
 
 
 def _help_all(context: typer.Context, catalog: Catalog, presets: Presets) -> str:
-    """Return a table of each group's settings: name, type or legal words, help, range and defaults."""
+    """Returns a table of each group's settings: name, type or legal words, help, range and defaults."""
     formatter = context.make_formatter()
     about = "Change a setting with --set NAME=VALUE, or in a file of lines NAME = VALUE (TOML) with --config FILE."
     context.command.format_usage(context, formatter)
@@ -163,7 +163,7 @@ def _help_all(context: typer.Context, catalog: Catalog, presets: Presets) -> str
 
 
 def _defaults(one: Setting, group: str, presets: Presets) -> str:
-    """Return the default in words, or each preset's where they differ: `thesis 16; quick, tiny 8`."""
+    """Returns the default in words, or each preset's where they differ: `thesis 16; quick, tiny 8`."""
     named: dict[str, list[str]] = {}
     for preset, instances in presets.items():
         named.setdefault(_written(getattr(instances[group], one.field)), []).append(preset)

@@ -48,7 +48,7 @@ class SpreadOptions:
 
     @property
     def spread(self) -> Spread:
-        """The choice as the commands take it. UsageError for a shard that is none."""
+        """Returns the choice as the commands take it. Raises UsageError for a shard that is none."""
         from dpcli.runtime.machines import shards, spread
 
         return spread.Spread(self.jobs, shards.Shard.parse(self.shard) if self.shard else None, self.dask)

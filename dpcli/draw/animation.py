@@ -52,7 +52,7 @@ def output_kind(path: Path) -> str:
 def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, force: bool = False) -> None:
     """Writes u8 pictures (H,W,3), or (H,W,4) for .png and folders, all of one size, to what the name says.
 
-    A .png takes the first one. Nothing half-written stays under the name. UsageError when it exists and `force` is off.
+    A .png takes the first one. Nothing half-written stays under the name. Raises UsageError when it exists and `force` is off.
     """
     kind = output_kind(path)
     if path.exists() and not force:

@@ -18,7 +18,7 @@ class Theme(NamedTuple):
 
     @property
     def page(self) -> RGB:
-        """The color between the cells of a sheet: a little lighter than a dark cell, white beside a white one."""
+        """Returns the color between the cells of a sheet: a little lighter than a dark cell, white beside a white one."""
         red, green, blue = (min(channel + 10, 255) for channel in self.background)
         return red, green, blue
 

@@ -21,7 +21,7 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: n
     """Writes one frame of points f32 or f64 (N,3), which stay so, colors u8 (N,3) (None: by part), part ids (N).
 
     The ids are an int property `part`.
-    Binary, little-endian, PLY 1.0 (Turk 1994). DataError on shapes that don't fit, or when it can't be written.
+    Binary, little-endian, PLY 1.0 (Turk 1994). Raises DataError on shapes that don't fit, or when it can't be written.
     """
     colors = part_colors(part) if colors is None else colors
     count = len(points)

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class PointSequence(Protocol):
-    """A point cloud sequence: frame t is points[frame_offsets[t]:frame_offsets[t + 1]]."""
+    """Describes a point cloud sequence: frame t is points[frame_offsets[t]:frame_offsets[t + 1]]."""
 
     name: str
     points: np.ndarray  # [P, 3]
@@ -21,11 +21,11 @@ class PointSequence(Protocol):
 
     @property
     def num_frames(self) -> int:
-        """The number of frames, T."""
+        """Returns the number of frames, T."""
 
 
 class CloudsSource(Protocol):
-    """An open file of S sequences."""
+    """Describes an open file of S sequences."""
 
     path: Path
     length_unit: str
@@ -41,7 +41,7 @@ class CloudsSource(Protocol):
 
 
 class ViewsSource(Protocol):
-    """An open file of pictures of V cameras at T times."""
+    """Describes an open file of pictures of V cameras at T times."""
 
     header: Any  # num_views, num_frames, size, role, reference, camera_centers()
 

@@ -69,7 +69,7 @@ def text_font(size: int) -> Any:
 
 
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB, size: int = 13) -> None:
-    """Writes a text in one line on a PIL drawing, shortened to the room (pixels) there is; names may hold ends of lines."""
+    """Writes a text in one line on a PIL drawing, shortened to the width (pixels) there is; names may hold ends of lines."""
     font, text = text_font(size), printable(text)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"

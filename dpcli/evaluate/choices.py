@@ -27,7 +27,7 @@ FVD_VARIANTS = ("styleganv", "videogpt", "disco", "consistent4d")
 
 
 def parse_video_metrics(text: str | None) -> tuple[str, ...] | None:
-    """Returns the names in `psnr,ssim` in the order they are shown; None stays None. UsageError for metrics there aren't.
+    """Returns the names in `psnr,ssim` in display order; None stays None. Raises UsageError for metrics there aren't.
 
     >>> parse_video_metrics("ssim, psnr")
     ('psnr', 'ssim')
@@ -43,7 +43,7 @@ def parse_video_metrics(text: str | None) -> tuple[str, ...] | None:
 
 
 def parse_metrics(text: str | None) -> tuple[str, ...] | None:
-    """Returns the names in `accuracy,miou` without repeats; None stays None. UsageError where none is named.
+    """Returns the names in `accuracy,miou` without repeats; None stays None. Raises UsageError where none is named.
 
     Whether a file has them is told when its kind is known.
     """

@@ -127,17 +127,17 @@ class FitConfig:
 
     @property
     def blended_parts(self) -> int:
-        """The parts whose motions the fit blends: with 16 instead of the thesis's 8 the network tears bodies into pieces."""
+        """Returns how many parts' motions the fit blends: with 16 instead of the thesis's 8 the network tears bodies apart."""
         return min(self.parts, 8)
 
     @property
     def steps(self) -> int:
-        """The steps of both stages together."""
+        """Returns the steps of both stages together."""
         return self.dense_steps + self.sparse_steps
 
     @property
     def sparse_from(self) -> int:
-        """The first step of the sparse stage; past the end when it is switched off."""
+        """Returns the first step of the sparse stage; past the end when it is switched off."""
         return self.dense_steps if self.sparse else self.steps
 
 

@@ -31,17 +31,17 @@ class Targets:
 
     @property
     def num_views(self) -> int:
-        """The number of views, V."""
+        """Returns the number of views, V."""
         return self.pictures.shape[0]
 
     @property
     def num_frames(self) -> int:
-        """The number of frames, T."""
+        """Returns the number of frames, T."""
         return self.pictures.shape[1]
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the pictures, pixels."""
+        """Returns width and height of the pictures, pixels."""
         return self.pictures.shape[3], self.pictures.shape[2]
 
     def times(self) -> Tensor:

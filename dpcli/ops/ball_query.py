@@ -76,7 +76,7 @@ def space_time_ball_query_reference(
     *,
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Is the torch twin of `space_time_ball_query`: all pairs, in blocks of bounded memory."""
+    """Computes `space_time_ball_query` in plain torch, as a reference: all pairs, in blocks of bounded memory."""
     return _any_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
 
 
@@ -116,7 +116,7 @@ def _frame_indices(name: str, times: torch.Tensor, owner: torch.Tensor) -> torch
 
 
 def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device, trim: bool) -> torch.Tensor:
-    """(R,) squared radii; `trim`: without trailing zeros, which accept nothing but would widen the window in time."""
+    """Returns squared radii (R,); `trim`: without trailing zeros, which accept nothing but would widen the window in time."""
     radii = torch.as_tensor(radii, dtype=torch.float32, device="cpu").detach()
     if radii.ndim != 1 or not bool((torch.isfinite(radii) & (radii >= 0)).all()):
         raise ValueError(

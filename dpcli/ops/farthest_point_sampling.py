@@ -43,7 +43,7 @@ def fps(
 def fps_reference(
     points: torch.Tensor, num_samples: int, *, start: int = 0, lengths: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Is the torch twin of `fps`: same arguments, same indices, one vectorized pass over all points per sample."""
+    """Computes `fps` in plain torch, as a reference: same arguments and indices, a vectorized pass per sample."""
     points, lengths = _checked(points, num_samples, start, lengths)
     return _fps_torch(points, num_samples, start, lengths)
 

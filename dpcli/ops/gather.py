@@ -83,7 +83,7 @@ class _GatherMean(torch.autograd.Function):
 
 
 class _GatherRows(torch.autograd.Function):
-    """index_select of rows whose indices come cloud after cloud, equally many for each."""
+    """Computes index_select of rows whose indices come cloud after cloud, equally many for each, with its gradient."""
 
     @staticmethod
     def forward(ctx, flat: Tensor, rows: Tensor, batch: int) -> Tensor:

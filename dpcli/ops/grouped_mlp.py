@@ -29,7 +29,7 @@ _LANES = 8  # channels in a vector of the kernels
 
 @dataclass
 class Norm:
-    """Affine batch normalization of C channels: weight and bias (C), and either given or returned statistics (C)."""
+    """Holds affine batch normalization of C channels: weight and bias (C), and either given or returned statistics (C)."""
 
     weight: Tensor
     bias: Tensor
@@ -48,7 +48,7 @@ def grouped_mlp(
     linear2: tuple[Tensor, Tensor],  # weight (C2,C1), bias (C2)
     norm2: Norm,
 ) -> tuple[Tensor, list[Tensor]]:
-    """max over K of relu(bn2(W2 relu(bn1(W1 [x_j - x_i, f_j])))) (PointNet++'s set abstraction with two layers).
+    """Computes max over K of relu(bn2(W2 relu(bn1(W1 [x_j - x_i, f_j])))) (PointNet++'s set abstraction with two layers).
 
     Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
     Differentiable in features, weights, biases and norms; not in positions. The fast path takes float32, C1 in eights and
@@ -80,7 +80,8 @@ def grouped_activations(
     linear2: tuple[Tensor, Tensor],
     norm2: Norm,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """The two layers' activations before pooling, [(B,M,K,C1), (B,M,K,C2)], and the statistics. Arguments as `grouped_mlp`.
+    """Returns both layers' activations before pooling, [(B,M,K,C1), (B,M,K,C2)], and the statistics. Arguments as
+    `grouped_mlp`.
 
     The first linear layer acts on points before they are gathered: W [x_j - x_i, f_j] = (W [x_j, f_j]) - W_x x_i.
     Given statistics are folded into the weights.
@@ -151,7 +152,7 @@ def _frozen_pieces(
 
 
 def _folded(linear: tuple[Tensor, Tensor], norm: Norm) -> tuple[Tensor, Tensor]:
-    """The linear layer with its batch norm's scale and shift in it."""
+    """Returns weight and bias of the linear layer with its batch norm's scale and shift in them."""
     scale = norm.weight * torch.rsqrt(norm.var + norm.eps)
     return linear[0] * scale[:, None], (linear[1] - norm.mean) * scale + norm.bias
 
@@ -167,7 +168,7 @@ def _project(
 
 
 def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Batch norm by the batch's own statistics and ReLU; ReLU alone where given statistics are folded in already."""
+    """Applies batch norm by the batch's own statistics and ReLU; ReLU alone where given statistics are folded in already."""
     if norm.mean is not None:
         return (torch.relu(values) if values.requires_grad else values.relu_()), (norm.mean, norm.var)
     if values.dtype == torch.bfloat16:  # products may come in bfloat16, whose eight bits are too few for statistics
@@ -189,8 +190,11 @@ def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):
 
 
 class _GroupedMLP(torch.autograd.Function):
-    """The training path on a CPU. With `table` and `offset` (the projected points and centers), the gradient of the first
-    layer's weights reaches them through those two; without, weight1 and bias1 act on the relative positions alone."""
+    """Computes `grouped_mlp` and its gradients on a CPU.
+
+    With `table` and `offset` (the projected points and centers), the gradient of the first layer's weights reaches them through
+    those two; without, weight1 and bias1 act on the relative positions alone.
+    """
 
     @staticmethod
     def forward(ctx, points, centers, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):
@@ -246,7 +250,7 @@ class _GroupedMLP(torch.autograd.Function):
 
 
 class _FromPositions:
-    """First layer on relative positions x alone: W x + b. Its statistics and gradients follow from moments of x."""
+    """Computes a first layer on relative positions x alone, W x + b; its statistics and gradients follow from moments of x."""
 
     def __init__(self, points: Tensor, centers: Tensor, idx: Tensor, weight: Tensor, bias: Tensor) -> None:
         self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
@@ -255,7 +259,7 @@ class _FromPositions:
         self.weight, self.bias = weight.detach(), bias.detach()
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and biased variance (C) over all rows, and the kept moments of x."""
+        """Returns mean and biased variance (C) over all rows, and keeps the moments of x."""
         sums = torch.zeros(_BLOCKS, 9, dtype=torch.float64)
         self.kernels.moments_xyz(*self.arrays, sums.numpy())
         moments = sums.sum(0) / self.rows
@@ -267,23 +271,23 @@ class _FromPositions:
         return (weight @ self.mean + self.bias).float(), var.float()
 
     def fold(self, scale: Tensor, inverse: Tensor, shift: Tensor) -> None:
-        """Take batch norm into the weights: relu(scale * (W x + b - mean) + shift)."""
+        """Takes batch norm into the weights: relu(scale * (W x + b - mean) + shift)."""
         self.scale, self.inverse = scale, inverse
         weight = self.weight * scale[:, None]
         bias = shift - (weight.double() @ self.mean).float()
         self.inputs = (*self.arrays, weight.t().contiguous().numpy(), bias.numpy())
 
     def hidden(self, first: int, out: np.ndarray) -> None:
-        """The layer's activations of a piece (rows,C) from centroid `first` on."""
+        """Writes the layer's activations of a block of rows (rows,C), from centroid `first` on, to `out`."""
         self.kernels.hidden_xyz(*self.inputs, first, out)
 
     def begin_backward(self) -> list[tuple[int, int]]:
-        """Ranges of centroids that may go through `back` at the same time."""
+        """Returns ranges of centroids that may go through `back` at the same time."""
         self.sums = torch.zeros(TASKS, 4, self.channels, dtype=torch.float64)
         return ranges(self.idx.shape[0] * self.idx.shape[1], TASKS)
 
     def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
-        """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
+        """Adds the gradient of a block of rows to the sums of its task: arrays as the kernel's hidden .. grad_weight."""
         self.kernels.back_xyz(*arrays, *self.arrays, first, self.sums[task].numpy())
 
     def gradients(self) -> tuple[Tensor | None, ...]:
@@ -298,7 +302,7 @@ class _FromPositions:
 
 
 class _FromTable:
-    """First layer as a difference of projected points and centers: table[j] - offset[i], offset = W_x center."""
+    """Computes a first layer as a difference of projected points and centers: table[j] - offset[i], offset = W_x center."""
 
     def __init__(self, points, centers, idx, table: Tensor, offset: Tensor, weight: Tensor) -> None:
         self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
@@ -307,7 +311,7 @@ class _FromTable:
         self.table, self.offset = table.contiguous(), offset.contiguous()
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and biased variance (C) over all rows."""
+        """Returns mean and biased variance (C) over all rows."""
         self.sums = torch.empty(self.idx.shape[0] * self.idx.shape[1], self.channels)
         squares = torch.zeros(_BLOCKS, self.channels, dtype=torch.float64)
         self.kernels.moments_table(
@@ -318,17 +322,17 @@ class _FromTable:
         return self.mean, (squares.sum(0) / self.rows - mean**2).clamp_min(0).float()
 
     def fold(self, scale: Tensor, inverse: Tensor, shift: Tensor) -> None:
-        """Take batch norm into the table: relu(scale * (table - offset - mean) + shift)."""
+        """Takes batch norm into the table: relu(scale * (table - offset - mean) + shift)."""
         self.scale, self.inverse = scale, inverse
         table = torch.addcmul(shift - self.mean * scale, self.table, scale)
         self.inputs = (table.numpy(), (self.offset * scale).numpy(), self.idx.numpy())
 
     def hidden(self, first: int, out: np.ndarray) -> None:
-        """The layer's activations of a piece (rows,C) from centroid `first` on."""
+        """Writes the layer's activations of a block of rows (rows,C), from centroid `first` on, to `out`."""
         self.kernels.hidden_table(*self.inputs, first, out)
 
     def begin_backward(self) -> list[tuple[int, int]]:
-        """Ranges of centroids that may go through `back` at the same time: of whole clouds, as these share no point."""
+        """Returns ranges of centroids that may go through `back` at the same time: of whole clouds, as these share no point."""
         batch, nodes, channels = self.table.shape
         self.packed = torch.zeros(-(-channels // (2 * _LANES)), batch, nodes, 2 * _LANES)
         self.to_offset = torch.empty_like(self.sums)
@@ -337,7 +341,7 @@ class _FromTable:
         return [(low * count, high * count) for low, high in ranges(batch, TASKS)]
 
     def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
-        """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
+        """Adds the gradient of a block of rows to those of table and offset: arrays as the kernel's hidden .. grad_weight."""
         self.kernels.back_table(*arrays, self.inputs[2], first, *self.targets)
 
     def gradients(self) -> tuple[Tensor | None, ...]:
@@ -356,14 +360,14 @@ class _FromTable:
         return to_table, offset.view_as(self.offset), None, None, grad_norm, total
 
     def _products(self, first: Tensor, second: Tensor, shift: Tensor) -> Tensor:
-        """Per channel the sum over all rows of first * (second - shift)."""
+        """Returns, per channel, the sum over all rows of first * (second - shift)."""
         parts, shape = torch.zeros(_BLOCKS, self.channels, dtype=torch.float64), (-1, self.channels)
         self.kernels.products(first.view(shape).numpy(), second.view(shape).numpy(), shift.numpy(), parts.numpy())
         return parts.sum(0).float()
 
 
 class _Room:
-    """Holds a thread's piece of activations lives, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
+    """Holds a thread's workspace: a block's activations, narrow and wide, as tensors (rows,C) and as arrays for the kernels."""
 
     def __init__(self, hidden: Tensor, wide: Tensor) -> None:
         self.hidden, self.wide = hidden, wide
@@ -372,12 +376,12 @@ class _Room:
         self.flat = (self.array.reshape(-1), wide.numpy().reshape(-1))
 
     def cut(self, rows: int) -> _Room:
-        """Its first rows."""
+        """Returns the workspace cut to its first rows."""
         return self if rows == len(self.hidden) else _Room(self.hidden[:rows], self.wide[:rows])
 
 
 class _Pieces:
-    """Pieces of about _PIECE bytes of activations, (rows,C1) and (rows,widest), and the threads that share them."""
+    """Cuts work into blocks of about _PIECE bytes of activations, (rows,C1) and (rows,widest), shared among threads."""
 
     def __init__(self, first: _FromPositions | _FromTable, widest: int) -> None:
         self.neighbors, self.widths = first.idx.shape[2], (first.channels, widest)
@@ -385,11 +389,11 @@ class _Pieces:
         self.step = min(self.count, max(1, _PIECE // (4 * self.neighbors * sum(self.widths))))
 
     def of(self, low: int, high: int) -> list[tuple[int, int]]:
-        """The pieces of centroids low..high-1."""
+        """Returns the blocks (low, high) of centroids low..high-1."""
         return steps(low, high, self.step)
 
     def share(self, tasks: list[list[tuple[int, int]]], work: Callable[[int, int, _Room], None]) -> None:
-        """Call work(task, first centroid, room) for every piece: a task's in order, by one thread, tasks at the same time."""
+        """Calls work(task, first centroid, workspace) for every block: a task's in order, by one thread, tasks in parallel."""
         rows = self.step * self.neighbors
 
         def through(task: int, pieces: list[tuple[int, int]], room: _Room) -> None:
@@ -400,7 +404,7 @@ class _Pieces:
 
 
 def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Second linear layer (no bias) and its pooling, piece by piece: neither layer's activations are ever stored.
+    """Computes the second linear layer (no bias) and its pooling block by block: neither layer's activations are ever stored.
 
     Returns the largest values (M,C2) and their rows i32, and of the hidden layer h the Gram matrix h'h and the sum, in
     float64.
@@ -433,7 +437,7 @@ def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Te
 def _sort_pooled(
     first: _FromPositions | _FromTable, grad: Tensor, out: Tensor, best: Tensor, where: Tensor, mean: Tensor
 ) -> tuple[tuple[np.ndarray, ...], Tensor]:
-    """The kernel `sort_pooled`: (order, values, starts), and the sums (2,C2)."""
+    """Runs the kernel `sort_pooled` and returns (order, values, starts), and the sums (2,C2)."""
     count, c2 = grad.shape
     order, values = torch.empty(count, c2, dtype=torch.int32), torch.empty(count, c2)
     starts = torch.empty(count, first.idx.shape[2] + 1, dtype=torch.int32)
@@ -445,7 +449,8 @@ def _sort_pooled(
 def _back_pool(
     first: _FromPositions | _FromTable, pooled: tuple[np.ndarray, ...], weight: Tensor, mixed: Tensor, constant: Tensor
 ) -> Tensor:
-    """Send d(linear output), the sparse `pooled` times weight and its affine part h -> h @ mixed + constant, into `first`.
+    """Propagates the gradient at the linear layer's output to `first`: the sparse `pooled` times weight, and h @ mixed +
+    constant.
 
     Returns the sum of pooled times h, (C2,C1).
     """
@@ -467,7 +472,7 @@ def _back_pool(
 
 
 def _linear_statistics(gram: Tensor, total: Tensor, rows: int, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and biased variance of W h + b over the rows, from h'h and sum(h): no pass over the wide layer."""
+    """Returns mean and biased variance of W h + b over the rows, from h'h and sum(h): no pass over the wide layer."""
     mean = total / rows
     covariance = (gram / rows - torch.outer(mean, mean)).float()  # the cancellation is over: the rest in float32
     var = ((weight @ covariance) * weight).sum(1).clamp_min(0)

@@ -12,7 +12,9 @@ _CENTERS = 64  # whose sums are held at a time: a few MiB, which stay in the cac
 
 
 def kernel_convolution(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix: Tensor) -> Tensor:
-    """out[b,p,g] = sum_k sum_j weight[b,p,j, slot[g,k]] * features[b, index[b,p,j], g] @ matrix[k]   (as EPN has it)
+    """Computes an SE(3) point convolution (EPN; Chen et al. 2021): sums over neighbors, times the kernel's weights.
+
+    out[b,p,g] = sum_k sum_j weight[b,p,j, slot[g,k]] * features[b, index[b,p,j], g] @ matrix[k]
 
     features (B,N,G,C); index (B,P,n) i64, the neighbors of every center; weight (B,P,n,D), what each counts at D kernel
     positions that the group permutes; slot (G,D) i64, the position that rotation g makes of kernel point k;
@@ -29,7 +31,7 @@ def kernel_convolution(features: Tensor, index: Tensor, weight: Tensor, slot: Te
 def kernel_convolution_reference(
     features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix: Tensor
 ) -> Tensor:
-    """The torch twin of `kernel_convolution`: same arguments, same result, any precision and device."""
+    """Computes `kernel_convolution` in plain torch, as a reference: same arguments, same result, any precision and device."""
     _check(features, index, weight, slot, matrix)
     rows = torch.arange(len(features), device=features.device)[:, None, None]
     near = features[rows, index].transpose(2, 3)  # [B, P, G, n, C]
@@ -54,7 +56,7 @@ def _check(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix
 
 
 class _Sums:
-    """The kernel sums of one batch, a few centers at a time, and their transpose."""
+    """Computes the kernel sums of one batch, a few centers at a time, and their transpose."""
 
     def __init__(self, features: Tensor, index: Tensor, weight: Tensor, slot: Tensor) -> None:
         self.features, self.index, self.weight = features, index, weight
@@ -69,13 +71,13 @@ class _Sums:
         self.turned = torch.empty(_CENTERS, self.orbit * self.rotations, self.channels)
 
     def pieces(self):
-        """Every (cloud, centers) piece."""
+        """Yields every block of centers as (cloud, slice of centers)."""
         for b in range(len(self.index)):
             for start in range(0, self.index.shape[1], _CENTERS):
                 yield b, slice(start, min(start + _CENTERS, self.index.shape[1]))
 
     def forward(self, b: int, piece: slice) -> Tensor:
-        """Sums (centers*G, D*C) of a piece, in a buffer that the next piece overwrites."""
+        """Returns the sums (centers*G, D*C) of a block of centers, in a buffer that the next block overwrites."""
         from dpcli.ops.cpu.kernel_convolution import group_forward
 
         size = piece.stop - piece.start
@@ -87,7 +89,7 @@ class _Sums:
         return turned.view(size * self.rotations, -1)
 
     def backward(self, b: int, piece: slice, grad: Tensor, out: Tensor) -> None:
-        """Add the gradient of a piece's sums (centers*G, D*C) into out (B,N,G*C)."""
+        """Adds the gradient of a block's sums (centers*G, D*C) into out (B,N,G*C)."""
         from dpcli.ops.cpu.kernel_convolution import group_backward
 
         size = piece.stop - piece.start

@@ -60,7 +60,7 @@ def knn(
 def knn_reference(
     query: torch.Tensor, points: torch.Tensor, k: int, *, lengths: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Is the torch twin of `knn`: same arguments, same result."""
+    """Computes `knn` in plain torch, as a reference: same arguments, same result."""
     query, points, lengths = _checked(query, points, k, lengths)
     return _knn_torch(query, points, k, lengths)
 

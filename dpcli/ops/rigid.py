@@ -46,7 +46,7 @@ def weighted_kabsch(
 
 
 def weighted_kabsch_reference(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Is the torch twin of `weighted_kabsch`: same arguments, same result up to rounding."""
+    """Computes `weighted_kabsch` in plain torch, as a reference: same arguments, same result up to rounding."""
     _check(source, target, weights)
     return _kabsch_torch(source, target, weights)
 
@@ -111,7 +111,7 @@ def rigid_flow(
 
 
 def rigid_flow_reference(points: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """Is the torch twin of `rigid_flow`: same arguments, same result up to rounding."""
+    """Computes `rigid_flow` in plain torch, as a reference: same arguments, same result up to rounding."""
     return torch.einsum("bns,bsnd->bnd", mask, apply_motions(points, rotation, translation)) - points
 
 

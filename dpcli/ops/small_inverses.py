@@ -43,7 +43,7 @@ def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "s
 
 
 def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
-    """Is the torch twin of `small_inverse`: same arguments, same guard."""
+    """Computes `small_inverse` in plain torch, as a reference: same arguments, same guard."""
     _check(matrices, guard)
     if matrices.shape[-1] > _BLOCKS:
         return _cholesky_inverse(matrices, min_det, guard)

@@ -101,7 +101,7 @@ class Network:
 
     @property
     def place(self) -> Path:
-        """The folder of this backbone's networks."""
+        """Returns the folder of this backbone's networks."""
         return self.folder / self.backbone
 
     def cell(self, name: str, clouds: Path, *words: str):
@@ -121,7 +121,7 @@ class Network:
 
     @property
     def fused(self) -> Path:
-        """The scores file of both streams of the flow baseline."""
+        """Returns the scores file of both streams of the flow baseline."""
         return self.place / f"{self.plan.preset}-two-streams-seed{self.seed}.h5"
 
     def flow_file(self) -> Path:

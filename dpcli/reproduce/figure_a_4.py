@@ -48,7 +48,7 @@ def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str], l
 
 
 def gains(files: Sequence[Path], static: Sequence[Path] | None = None) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Class names, static recall and gain of the final score over it, percentage points f64 (C), means over files.
+    """Returns class names, static recall and gain of the final score over it, percentage points f64 (C), means over files.
 
     static: where the static stream's scores are, `files` themselves by default, in the same order.
     """

@@ -58,7 +58,7 @@ def dpc(*words: object, threads: int | None = None) -> str:
 
 
 def attempt(work: Callable[[], object], what: str) -> str:
-    """Does what may fail; returns why it failed, or nothing. Being asked to stop is no failure."""
+    """Calls what may fail and returns why it failed, or nothing. Being asked to stop is no failure."""
     try:
         work()
     except SystemExit as ended:
@@ -138,7 +138,7 @@ class Cell:
 
     @property
     def key(self) -> list:
-        """The data and the words, which must be equal for a result to stand."""
+        """Returns the data and the words, which must be equal for a result to stand."""
         return [digest(self.clouds), self.train, self.predict]
 
     def known(self) -> dict | None:

@@ -18,7 +18,7 @@ _LOST = ("Connection closed", "Connection reset", "Broken pipe", "peer", "NCCL",
 
 @dataclass(frozen=True)
 class Processes:
-    """This process's number among `count`; the first one alone writes files and talks."""
+    """Tells this process's number among `count`; the first one alone writes files and talks."""
 
     rank: int = 0
     count: int = 1
@@ -49,7 +49,7 @@ class Processes:
 
 
 def from_environment() -> Processes:
-    """Returns what torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. UsageError when they are no numbers."""
+    """Returns what torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. Raises UsageError when they are no numbers."""
     try:
         return Processes(
             *(

@@ -14,7 +14,7 @@ REDUCED = torch.bfloat16  # the exponents of float32, so that no loss scaling is
 
 
 def reduced_products(device: torch.device, on: bool) -> AbstractContextManager:
-    """A block whose matrix products are made in bfloat16; nothing changes where `on` is False."""
+    """Returns a context whose matrix products are made in bfloat16; nothing changes where `on` is False."""
     return torch.autocast(device.type, REDUCED, enabled=on)
 
 
@@ -24,7 +24,7 @@ def is_reduced(tensor: Tensor) -> bool:
 
 
 def full_precision(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function in float32, whatever block it is called in: positions in bfloat16 are off by half a hundredth.
+    """Returns the function made to compute in float32 in any context: positions in bfloat16 are off by half a hundredth.
 
     The first tensor among the positional arguments says the device.
     """

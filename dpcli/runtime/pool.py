@@ -70,7 +70,7 @@ def _end_with_parent() -> None:
 
 
 class Worker(ForkServerProcess):
-    """A process that ends when its executor says so, although it ignores SIGTERM, which whoever stops a batch job sends to all."""
+    """Ends when its executor says so, although it ignores SIGTERM, which whoever stops a batch job sends to all processes."""
 
     def terminate(self) -> None:
         """Ends the process. From Python 3.12 on a broken executor holds a lock until its processes ended."""

@@ -15,7 +15,7 @@ _PLAIN_INTERVAL = 5.0  # seconds between lines in a log that is not a terminal
 
 
 class _Log:
-    """Messages on stderr. `level` is 0 (quiet: errors only), 1 (default) or 2 (verbose)."""
+    """Writes messages on stderr. `level` is 0 (quiet: errors only), 1 (default) or 2 (verbose)."""
 
     def __init__(self) -> None:
         self.level = 1

@@ -42,7 +42,7 @@ _FILES = (
 
 @dataclass
 class LossWatch:
-    """Says when a training has run away: no finite loss or gradient for five steps on end, or a loss that is on average above
+    """Says when a training has diverged: no finite loss or gradient for five steps on end, or a loss that is on average above
     `limit`. beside: what is said of that limit.
     """
 
@@ -69,7 +69,10 @@ def diverged(problem: str, where: str, remedy: str) -> DpcError:
 
 
 class RunFolder:
-    """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`.
+    """Keeps what a training run writes into its folder, and guards the folder against other runs.
+
+    It holds `config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`,
+    `curves.png`.
 
     columns: what a row of the log holds. curves: draws the rows into a picture file. Only looks until it is entered (`with`):
     that makes the folder, with `force` empties it of an earlier run, and keeps other processes from writing into it by

@@ -13,7 +13,7 @@ import numpy as np
 
 
 class PrepareStream(IntEnum):
-    """The streams of `dpc prepare`, beside those of the items, whose first key is their index."""
+    """Names the random streams of `dpc prepare`, beside those of the items, whose first key is their index."""
 
     TRACKS = 0  # points of an animal's surface that are followed
     ANIMAL_SHAPE = 1  # of a made animal
@@ -27,7 +27,7 @@ class PrepareStream(IntEnum):
 
 
 class ClassifyStream(IntEnum):
-    """The streams of `dpc classify`."""
+    """Names the random streams of `dpc classify`."""
 
     CLIPS = 1  # where an epoch's clips begin, and their order; key: the draw
     POINTS = 2  # points of a clip, and its augmentation; keys: the draw and the clip's place in it
@@ -38,7 +38,7 @@ class ClassifyStream(IntEnum):
 
 
 class SegmentStream(IntEnum):
-    """The streams of `dpc segment`."""
+    """Names the random streams of `dpc segment`."""
 
     FRAME_POINTS = 7001  # points of a training frame; keys: the sequence and the frame
     PAIR_ORDER = 7002  # order of an epoch's pairs; key: the epoch
@@ -50,7 +50,7 @@ class SegmentStream(IntEnum):
 
 
 class Generate4DStream(IntEnum):
-    """The streams of `dpc generate4d`."""
+    """Names the random streams of `dpc generate4d`."""
 
     FIRST_POINTS = 4001  # where the first Gaussians are
     FIRST_WEIGHTS = 4002  # the first weights of what is learned beside them

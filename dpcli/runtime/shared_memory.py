@@ -26,7 +26,7 @@ POSSIBLE = hasattr(os, "memfd_create") and os.path.isdir("/proc/self/fd")
 
 @dataclass(frozen=True)
 class Parcel:
-    """A pickled result and where its arrays are: lengths in bytes, each on a multiple of _HEAD, in order."""
+    """Holds a pickled result and where its arrays are: lengths in bytes, each on a multiple of _HEAD, in order."""
 
     path: str
     mark: bytes
@@ -108,7 +108,7 @@ def packed(function: Callable[[Any], Any], item: Any) -> Any:
 
 
 def unpacked(parcel: Parcel) -> Any:
-    """Returns the result in a Parcel; its arrays are views of the memory file. OSError when that can't be opened."""
+    """Returns the result in a Parcel; its arrays are views of the memory file. Raises OSError when that can't be opened."""
     number = os.open(parcel.path, os.O_RDWR | os.O_CLOEXEC)
     try:
         # all of it will be read: its pages are found once, instead of one fault after the other

@@ -17,7 +17,7 @@ _NAMES = ("SIGTERM", "SIGUSR1", "SIGUSR2")  # batch systems send one of these be
 
 @dataclass
 class StopRequest:
-    """`requested` turns True at the first stop signal; `name` says which."""
+    """Tells whether a stop was asked for: `requested` turns True at the first stop signal; `name` says which."""
 
     requested: bool = False
     name: str = ""

@@ -98,7 +98,10 @@ def _sort_header(path: Path) -> None:
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Returns tensors and header. DataError when the file is not whole, of another format (made by `maker`), or holds NaN."""
+    """Returns tensors and header of a weights file.
+
+    Raises DataError when the file is not whole, is not of the expected format (made by `maker`), or holds NaN.
+    """
     from safetensors import SafetensorError, safe_open
 
     with reading(path):
@@ -196,7 +199,7 @@ def _named(path: Path) -> Iterator[None]:
 def weights_summary(path: Path) -> dict[str, Any]:
     """Returns format, version, bytes, how many numbers of which types, model card, and the rest of the header, as values for JSON.
 
-    What is JSON in the header (configuration, class names, notes) is unpacked. DataError when the file is not whole.
+    What is JSON in the header (configuration, class names, notes) is unpacked. Raises DataError when the file is not whole.
     """
     from safetensors import SafetensorError, safe_open
 

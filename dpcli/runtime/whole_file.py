@@ -26,7 +26,7 @@ _IN_TEXT = re.compile(r"os error (\d+)|errno = (\d+)", re.IGNORECASE)  # safeten
 
 
 class DiskFull(DpcError):
-    """A file could not be written for want of room."""
+    """Says that a file could not be written because the disk is full."""
 
 
 def disk_full(
@@ -36,7 +36,7 @@ def disk_full(
     place: str | Path | None = "",
     needed: int = 0,
 ) -> DiskFull | None:
-    """Returns the error that a failed write to `path` ends with when there was no room for it, None for any other failure.
+    """Returns the error that a failed write to `path` ends with when the disk was full, None for any other failure.
 
     `error` is what the write raised; what it was raised from is looked at, too. `advice` ends the sentence. `place` lies on
     the disk that is full where `path` itself is no path; None: nobody knows. `needed`: bytes to be written, 0: nobody knows.
@@ -66,7 +66,7 @@ def _room(place: str | Path | None, needed: int) -> str:
 
 
 def reserve(file: int, size: int) -> None:
-    """Takes `size` bytes of room for an open file (its descriptor) now.
+    """Reserves `size` bytes on the disk for an open file (its descriptor) now.
 
     A mapped page that finds no room later ends the process by SIGBUS, without a word. OSError: there is no room.
     """
@@ -95,7 +95,7 @@ def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
     """Yields the name to write to instead of `path`: beside it, hidden, with its suffix; renamed to it when the block ends.
 
     The block may make a folder of that name. When it fails, nothing of it stays, and what was under `path` does.
-    many_writers: other processes may write `path` at the same time; the last one wins. Raises DiskFull where there was no room.
+    many_writers: other processes may write `path` at the same time; the last one wins. Raises DiskFull where the disk is full.
     """
     own = f".{os.getpid()}" if many_writers else ""
     part = path.with_name(f".{path.name}{own}.part{path.suffix}")
@@ -112,7 +112,7 @@ def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> None:
-    """Writes a file through `whole_file`. DataError when it can't be written, DiskFull where there was no room."""
+    """Writes a file through `whole_file`. Raises DataError when it can't be written, DiskFull where the disk is full."""
     try:
         with whole_file(path, many_writers=many_writers) as part:
             part.write_bytes(content)
@@ -121,7 +121,7 @@ def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> No
 
 
 def not_writable(path: Path, error: OSError) -> DataError:
-    """Returns the error that tells why no file can be made under a name, for a reason other than want of room."""
+    """Returns the error that tells why no file can be made under a name, for a reason other than a full disk."""
     if error.errno == errno.ENOENT and not path.absolute().parent.is_dir():
         return DataError(f"{path}: the folder {path.parent} does not exist; create it first")
     why = os.strerror(error.errno) if error.errno else str(error).partition("\n")[0]  # HDF5's own words are long

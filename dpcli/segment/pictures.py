@@ -43,12 +43,12 @@ class Look:
 
     @property
     def theme(self) -> Theme:
-        """The colors of the ground and of letters."""
+        """Returns the colors of the ground and of letters."""
         return DARK if self.dark else LIGHT
 
 
 def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """`found` i64 (N) renamed after the true parts it covers, so that colors agree.
+    """Returns `found` i64 (N) renamed after the true parts it covers, so that colors agree.
 
     Parts are paired such that the sum of IoU is largest; those left over take ids beyond the true ones; -1 stays.
     """
@@ -80,7 +80,7 @@ def parts_picture(
     """Writes a contact sheet: a row per sequence, its frames as columns, points colored by `part`.
 
     truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colors.
-    At most `frames` frames are shown, spread over the sequence. DataError on sequences without parts, truth of other
+    At most `frames` frames are shown, spread over the sequence. Raises DataError on sequences without parts, truth of other
     size, or when the picture can't be written.
     """
     if not sequences:
@@ -114,7 +114,7 @@ def _true_parts(sequence: CloudSequence, real: CloudSequence) -> np.ndarray:
 
 
 def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look: Look) -> list[np.ndarray]:
-    """Cells u8 (cell,cell,3), all of one scale."""
+    """Returns the frames `shown` drawn as cells u8 (cell,cell,3), all of one scale."""
     matrix = turntable_view(look.azimuth, look.elevation, look.up)
     seen = sequence.points @ matrix.T
     low, high = np.percentile(seen, [0.1, 99.9], axis=0)
@@ -142,7 +142,7 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) 
 
 
 def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> int:
-    """Swatches of the parts with their share of the points, right-aligned as far as half the row; where they start."""
+    """Draws swatches of the parts with their share of the points, right-aligned, on half the row; returns where they start."""
     ids, counts = np.unique(part, return_counts=True)
     font, start, left = text_font(11), right // 2, right
     for own, count in reversed(list(zip(ids.tolist(), counts.tolist(), strict=True))):
@@ -161,7 +161,7 @@ def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> in
 def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look: Look | None = None) -> None:
     """Writes an animation (.gif): one turn about the upright axis, while the frames pass to the last one and back.
 
-    Points are colored by `part`. DataError on a sequence without parts or when the file can't be written.
+    Points are colored by `part`. Raises DataError on a sequence without parts or when the file can't be written.
     """
     if path.suffix.lower() != ".gif":
         raise UsageError(f"{path}: unknown kind of animation {path.suffix!r}; expected .gif")

@@ -32,7 +32,7 @@ class Segmenter(ABC):
     @property
     @abstractmethod
     def slots(self) -> int:
-        """The number of columns of every mask."""
+        """Returns the number of columns of every mask."""
 
     @abstractmethod
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
@@ -66,7 +66,7 @@ class NetworkSegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
-        """The network's number of slots."""
+        """Returns the network's number of slots."""
         return self.model.config.slots
 
     @torch.inference_mode()
@@ -91,7 +91,7 @@ class ClassicalSegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
-        """The most parts that the method may find."""
+        """Returns the most parts that the method may find."""
         return max(self.settings.max_parts, self.settings.parts or 0)
 
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:

@@ -19,7 +19,7 @@ _OF_FRAMES = ("time", *OF_PARTS)
 
 
 class CloudsReader:
-    """Lazy access to the sequences of a `clouds` (or `parts`) file.
+    """Reads the sequences of a `clouds` (or `parts`) file lazily.
 
     The index (names, labels, offsets) is read and checked on opening: a few dozen bytes a sample. The HDF5 handles are
     opened on first use in each process and never pickled, so a DataLoader may hand the reader to its workers. Those of
@@ -149,7 +149,7 @@ class CloudsReader:
         return self._file
 
     def _set(self, name: str) -> h5py.Dataset:
-        """A data set of the file, found once in each process."""
+        """Returns a data set of the file, found once in each process."""
         file = self.file
         if name not in self._sets:
             self._sets[name] = file[name]
@@ -158,10 +158,10 @@ class CloudsReader:
     def read(
         self, index: int, frames: slice | Sequence[int] | None = None, fields: Sequence[str] | None = None
     ) -> CloudSequence:
-        """Sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
+        """Returns sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
 
         Touches only what it needs: one contiguous read from the first to the last frame asked for.
-        DataError when a value is NaN or infinite, or the file is damaged there.
+        Raises DataError when a value is NaN or infinite, or the file is damaged there.
         """
         with reading(self.path):
             return self._read(index, frames, fields)
@@ -229,7 +229,7 @@ class CloudsReader:
 
 
 def _pick(values: np.ndarray, offsets: np.ndarray, picks: np.ndarray | None) -> np.ndarray:
-    """Rows of the frames `picks`, in that order."""
+    """Returns the rows of the frames `picks`, in that order."""
     if picks is None:
         return values
     return np.concatenate([values[offsets[t] : offsets[t + 1]] for t in picks])

@@ -33,7 +33,7 @@ _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; cl
 
 
 class CloudsWriter(ResumableWriter):
-    """Context manager that writes sequences to `path`; `ResumableWriter` says what it leaves when it is stopped.
+    """Writes sequences to `path`, as a context manager; `ResumableWriter` says what it leaves when it is stopped.
 
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
@@ -123,7 +123,7 @@ class CloudsWriter(ResumableWriter):
         # pose and joint are created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
-        """Appends one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
+        """Appends one sample. Raises DataError when it is malformed, lacks a declared field, or repeats a name."""
         self._check(sequence)
         self._append_sequence(sequence)
         self._note(sequence)
@@ -212,7 +212,7 @@ class CloudsWriter(ResumableWriter):
         self._write_shifts()
 
     def _write_shifts(self) -> None:
-        """The samples' shifts, f64 (S,3), zero where one has none; nothing where none has, as most files."""
+        """Writes the samples' shifts, f64 (S,3), zero where one has none; nothing where none has, as in most files."""
         rows = [np.zeros(3) if shift is None else np.asarray(shift, np.float64) for shift in self._shifts]
         if np.any(rows):
             self._file.create_dataset("shift", data=np.array(rows))

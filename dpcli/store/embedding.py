@@ -40,7 +40,7 @@ def write_embedding(
     provenance: Sequence[dict] = (),
     force: bool = False,
 ) -> None:
-    """Writes the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
+    """Writes the file whole or not at all. Raises UsageError when it exists and `force` is off, DataError on bad arrays."""
     refuse_existing(path, force)
     _check(str(path), names, labels, splits, streams)
     with AtomicFile(path) as file:
@@ -75,7 +75,7 @@ def _check(
 
 
 class EmbeddingReader:
-    """An `embedding` file in memory: names, splits, labels i32 (S), class_names, streams {name: StreamEmbedding}.
+    """Holds an `embedding` file in memory: names, splits, labels i32 (S), class_names, streams {name: StreamEmbedding}.
 
     Raises DataError when shapes disagree or a value is not finite.
     """

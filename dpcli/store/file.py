@@ -32,7 +32,7 @@ _CACHE = 1 << 20  # bytes, HDF5's own choice
 
 
 class StoreFile(h5py.File):
-    """An open file of the contract, whose block turns what HDF5 raises for damaged content into DataError."""
+    """Opens a file of the contract as a context whose block turns what HDF5 raises for damaged content into DataError."""
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
         path = self.filename if self.id.valid else "an HDF5 file"
@@ -143,7 +143,7 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
 
 
 def _refuse_lengths(item: h5py.Dataset, path: Path) -> None:
-    """Raises DataError where a text of variable length claims more bytes than the file has: libhdf5 makes room for it first."""
+    """Raises DataError where a text of variable length claims more bytes than the file has: libhdf5 allocates it first."""
     text = h5py.check_string_dtype(item.dtype)
     if text is None or text.length is not None or item.id.get_create_plist().get_nfilters() or not item.size:
         return

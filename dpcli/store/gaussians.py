@@ -29,7 +29,7 @@ _QUATERNIONS = ("quaternion", "frame_quaternion", "control_quaternion")
 
 @dataclass
 class GaussianScene:
-    """N Gaussians over T frames, S rigid parts, K control points, V cameras. World right-handed, y up; see ops/cameras.
+    """Holds N Gaussians over T frames, S rigid parts, K control points, V cameras. World right-handed, y up; see ops/cameras.
 
     Canonical: mean f32 (N,3); log_scale f32 (N,3) natural log of the standard deviations; quaternion f32 (N,4) wxyz,
     unit; opacity_logit f32 (N); sh f32 (N,(degree+1)^2,3). Motion: time f64 (T) seconds, rising; frame_mean f32 (T,N,3)
@@ -184,12 +184,12 @@ class GaussianScene:
 
 
 def opacity_of(logit: np.ndarray) -> np.ndarray:
-    """The logistic of logits f32 (N), without overflow: f32 (N), 0..1."""
+    """Returns the logistic of logits f32 (N), without overflow: f32 (N), 0..1."""
     return (0.5 * (1 + np.tanh(0.5 * logit))).astype(np.float32)
 
 
 def color_of(sh: np.ndarray) -> np.ndarray:
-    """The color u8 (N,3) of spherical harmonics (N,terms,3) that doesn't depend on the direction."""
+    """Returns the color u8 (N,3) of spherical harmonics (N,terms,3) that doesn't depend on the direction."""
     return (np.clip(0.5 + SH_C0 * sh[:, 0], 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -225,7 +225,7 @@ def write_scene(
     length_unit: str = "",
     force: bool = False,
 ) -> None:
-    """Writes one scene whole or not at all. UsageError when `path` exists and `force` is off; DataError as `validate`."""
+    """Writes a scene whole or not at all. Raises UsageError when `path` exists and `force` is off; DataError as `validate`."""
     refuse_existing(path, force)
     scene.validate(f"{path}")
     history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
@@ -246,7 +246,7 @@ def _write_arrays(file: h5py.File, scene: GaussianScene) -> None:
 
 
 def read_scene(path: str | Path) -> GaussianScene:
-    """Reads the whole scene into memory and validates it. DataError when the file isn't one, lacks a data set, or holds bad values."""
+    """Reads a scene into memory and validates it. Raises DataError for no scene, a missing data set, or bad values."""
     with open_store(path, ["gaussians"]) as file:
         missing = [key for key in LAYOUT if key not in file] + [
             key for key in ("size", "reference", "metrics") if key not in file.attrs
@@ -274,7 +274,7 @@ class SceneOrigin(NamedTuple):
 
 
 def scene_origin(path: str | Path) -> SceneOrigin:
-    """Reads where a scene comes from, and nothing of the scene itself. DataError as `open_store`, and without seed, source or unit."""
+    """Reads only where a scene comes from. Raises DataError as `open_store`, and without seed, source or unit."""
     with open_store(path, ["gaussians"]) as file:
         attributes = root_attributes(file)
         absent = [name for name in ("seed", "source", "length_unit") if name not in attributes]

@@ -63,7 +63,7 @@ def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
 
 
 def _check_heap(path: Path, data: mmap.mmap, place: int) -> None:
-    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself, but makes room for a heap first."""
+    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself, but allocates a heap first."""
     end = place + int.from_bytes(data[place + 8 : place + 16], "little")
     if end > len(data):
         raise DataError(

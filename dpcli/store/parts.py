@@ -110,7 +110,7 @@ def _check_motion(motion: np.ndarray, where: str) -> None:
 
 
 class PartsWriter(CloudsWriter):
-    """A CloudsWriter (same options and guarantees) whose samples come with a PartsSample; K = `num_parts`.
+    """Writes what CloudsWriter does (same options and guarantees), and with each sample a PartsSample; K = `num_parts`.
 
     `part` is always among the fields. Motions of parts that a sequence lacks are the identity, probabilities 0.
     """
@@ -147,7 +147,7 @@ class PartsWriter(CloudsWriter):
         motion: np.ndarray,  # f32 (Q,K,4,4)
         flow: Sequence[np.ndarray],  # Q times f32 (N_source,3)
     ) -> None:
-        """Appends one sample, whose `part` are the hard ids. DataError as `CloudsWriter.write`, `PartsSample.validate`."""
+        """Appends one sample, whose `part` are the hard ids. Raises as `CloudsWriter.write`, `PartsSample.validate`."""
         self._check(sequence)
         said = PartsSample(
             np.asarray(probability, _FIELD["part_probability"].dtype),
@@ -171,7 +171,7 @@ class PartsWriter(CloudsWriter):
 
 
 class PartsReader(CloudsReader):
-    """A CloudsReader of a `parts` file; `read_parts` reads what is said of one sequence. `num_parts` = K.
+    """Reads a `parts` file as CloudsReader does; `read_parts` reads what is said of one sequence. `num_parts` = K.
 
     The layout is checked on opening, the values of a sequence when it is read: DataError.
     """

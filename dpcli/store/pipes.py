@@ -53,7 +53,7 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
 
 @contextmanager
 def _spool() -> Iterator[Path]:
-    """Yields a folder in $TMPDIR for what goes through a pipe. Raises DiskFull that names $TMPDIR where there is no room."""
+    """Yields a folder in $TMPDIR for what goes through a pipe. Raises DiskFull that names $TMPDIR where that is full."""
     advice = "what goes through a pipe is kept there first; set TMPDIR to a folder with more room"
     try:
         place = tempfile.gettempdir()
@@ -81,7 +81,7 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
 
     That is an input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data)
     and is no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
-    DataError where the place can't be written to.
+    Raises DataError where the place can't be written to.
     """
     if path.is_dir() or not os.path.lexists(path):
         check_writable(path, option)

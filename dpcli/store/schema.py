@@ -19,7 +19,7 @@ _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", r
 
 @dataclass(frozen=True)
 class Field:
-    """One data set of a kind. `kind` is such as f32, i64, u8 or str; `shape` has letters where the number is the file's.
+    """Describes one data set of a kind. `kind`: f32, i64, u8, str ...; `shape` has letters for numbers that each file sets.
 
     group: the name is that of a group with a data set like this for each stream.
     """
@@ -33,14 +33,14 @@ class Field:
 
     @property
     def dtype(self) -> np.dtype:
-        """The type as numpy's. ValueError for strings, whose type is h5py's."""
+        """Returns the type as numpy's. Raises ValueError for strings, whose type is h5py's."""
         if self.kind == "str":
             raise ValueError(f"{self.name}: strings have no numpy type here")
         return np.dtype(f"{self.kind[0]}{int(self.kind[1:]) // 8}")
 
     @property
     def row(self) -> tuple[str | int, ...]:
-        """The shape of one entry along the first axis."""
+        """Returns the shape of one entry along the first axis."""
         return self.shape[1:]
 
     def in_words(self) -> str:
@@ -192,7 +192,7 @@ KINDS = tuple(TABLES)
 
 
 def fields_of(kind: str) -> dict[str, Field]:
-    """Returns all data sets that a file of a kind may have, by name. KeyError for a kind that doesn't exist.
+    """Returns all data sets that a file of a kind may have, by name. Raises KeyError for a kind that doesn't exist.
 
     >>> fields_of("parts")["pair"].in_words(), fields_of("parts")["points"].dtype
     ('i32 (Q,2)', dtype('float32'))

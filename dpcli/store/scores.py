@@ -27,7 +27,7 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 class ScoresWriter(ResumableWriter):
-    """Context manager; `write` one sample after the other, the file appears whole when the block ends.
+    """Writes one sample after the other by `write`, as a context manager; the file appears whole when the block ends.
 
     A score row is small (C floats), so rows are kept in memory until the end, as floats alone, and with `resume=True` in
     the journal, too: see `ResumableWriter`. `streams` names extra score arrays (such as static, dynamic) stored beside the final one.
@@ -128,7 +128,7 @@ class ScoresWriter(ResumableWriter):
 
 
 class ScoresReader:
-    """A `scores` file in memory: scores f32 (S,C), labels i32 (S), names, splits, class_names, streams {name: (S,C)},
+    """Holds a `scores` file in memory: scores f32 (S,C), labels i32 (S), names, splits, class_names, streams {name: (S,C)},
     rejected bool (S), None where nothing was asked to be.
 
     Raises DataError when shapes disagree, a value is not finite, a name repeats, or a label is out of range.
@@ -151,7 +151,7 @@ class ScoresReader:
 
     @property
     def stream_names(self) -> tuple[str, ...]:
-        """The streams in the order in which the network has them: static, dynamic, others by name."""
+        """Returns the streams in the order in which the network has them: static, dynamic, others by name."""
         return tuple(sorted(self.streams, key=lambda name: (name != "static", name != "dynamic", name)))
 
     def given(self, index: int) -> list[Any]:

@@ -24,7 +24,7 @@ from dpcli.text_files import parse_json
 
 
 class StatisticsWriter(ResumableWriter):
-    """Context manager; `write` one sample after the other, the file appears whole when the block ends: see `ResumableWriter`.
+    """Writes one sample after the other by `write`; the file appears whole when the block ends: see `ResumableWriter`.
 
     The metrics that they are for, the data and the choices are told by the last entry of the provenance.
     """
@@ -80,7 +80,7 @@ class StatisticsWriter(ResumableWriter):
 
 
 class StatisticsReader:
-    """A `statistics` file in memory; `read` gives the values of one sample. DataError when it is not what the contract says."""
+    """Holds a `statistics` file in memory; `read` returns one sample's values. Raises DataError when it breaks the contract."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -94,7 +94,7 @@ class StatisticsReader:
             raise DataError(f"{path}: {len(self._texts)} statistics for {len(self.names)} names; evaluate again")
 
     def read(self, index: int) -> dict[str, Any]:
-        """Returns the values of one sample, as they were written. DataError when they can't be read."""
+        """Returns the values of one sample, as they were written. Raises DataError when they can't be read."""
         try:
             return _unpacked(parse_json(self._texts[index], self.path))
         except (DataError, ValueError, TypeError, KeyError, RecursionError):

@@ -108,10 +108,10 @@ def _check_truth(name: str, frames: int, track: np.ndarray | None, part: np.ndar
 
 
 class ViewsWriter:
-    """Context manager; `add` one picture after the other in any order, the file appears whole when the block ends.
+    """Writes pictures one by one by `add`, in any order, as a context manager; the file appears whole when the block ends.
 
     track: f32 (T,M,3) true world positions of M surface points at every frame, part: i16 (M) their rigid part or bone,
-    -1 unknown; both optional. One picture is in memory at a time. DataError when the block ends and one is missing;
+    -1 unknown; both optional. One picture is in memory at a time. Raises DataError when the block ends and one is missing;
     UsageError when `path` exists and `force` is off.
     """
 
@@ -167,7 +167,7 @@ class ViewsWriter:
             file.create_dataset("part", data=part)
 
     def add(self, view: int, frame: int, rgba: np.ndarray) -> None:
-        """Writes one picture: u8 (H,W,4), straight (not premultiplied) alpha. DataError on another shape, or a second one."""
+        """Writes one picture: u8 (H,W,4), straight (not premultiplied) alpha. Raises DataError on another shape or a repeat."""
         views, frames = self._written.shape
         if not (0 <= view < views and 0 <= frame < frames):
             raise DataError(
@@ -203,7 +203,7 @@ class ViewsWriter:
 
 
 class ViewsReader:
-    """A `views` file, opened lazily in each process; the handle is never pickled. Context manager.
+    """Reads a `views` file, opened lazily in each process, as a context manager; the handle is never pickled.
 
     `header`: ViewsHeader. `track`: f32 (T,M,3) or None, `part`: i16 (M) or None, read when first asked for.
     Raises DataError when the file is not what the contract says.

@@ -37,7 +37,7 @@ class Baseline:
 
     @property
     def accuracy(self) -> float:
-        """The share of the judged videos that are right."""
+        """Returns the share of the judged videos that are right, 0..1."""
         return self.right / self.judged
 
 

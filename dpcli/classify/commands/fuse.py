@@ -145,7 +145,7 @@ def _labels(sources: Sequence[ScoresReader], rows: Sequence[np.ndarray]) -> np.n
 def _tell_other_models(
     held: Sequence[ScoresReader], judges: Sequence[str], readers: Sequence[ScoresReader], called: Sequence[str]
 ) -> None:
-    """Warns where weights come from another model's scores: fair for a twin trained on fewer videos, else an accident."""
+    """Warns where weights come from another model's scores: fair for one trained on fewer videos, else an accident."""
     for theirs, judge, reader, name in zip(held, judges, readers, called):
         one, other = _model_digest(theirs), _model_digest(reader)
         if one and other and one != other:

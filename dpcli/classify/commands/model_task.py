@@ -25,5 +25,5 @@ class ModelTask:
 
     @property
     def source(self) -> str:
-        """The name of the data as files record it."""
+        """Returns the name of the data as files record it."""
         return "stdin" if self.data == "-" else Path(self.data).name

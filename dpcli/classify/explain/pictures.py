@@ -66,7 +66,7 @@ def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
 
 
 def _drawer(cloud: ActivationCloud, axes: np.ndarray) -> Callable[[str, int], np.ndarray]:
-    """(stream, frame) -> cell u8 (_CELL,_CELL,3), all frames in one scale."""
+    """Returns a function from (stream, frame) to a cell u8 (_CELL,_CELL,3); all frames are drawn in one scale."""
     seen = cloud.sequence.points @ axes.T
     low, high = np.percentile(seen[:, :2], [0.2, 99.8], axis=0)
     scale = 0.92 * _CELL / max(float((high - low).max()), 1e-9)
@@ -83,7 +83,7 @@ def _drawer(cloud: ActivationCloud, axes: np.ndarray) -> Callable[[str, int], np
 
 
 def _sheet(blocks: list[tuple[str, list[str], dict[str, list[np.ndarray]]]]) -> Any:
-    """Blocks of a title, column heads and labeled rows of cells, with the scale of colors at the foot."""
+    """Draws blocks of a title, column heads and labeled rows of cells, with the scale of colors at the foot."""
     from PIL import Image, ImageDraw
 
     step = _CELL + _GAP

@@ -156,7 +156,7 @@ class KinetConfig:
 
     @property
     def signed_columns(self) -> list[int]:
-        """The places of the columns that are speeds: their middle is 0."""
+        """Returns the places of the columns that are speeds: their middle is 0."""
         return [place for place, middle in enumerate(self.scales[1::2]) if middle == 0]
 
     def _check_reach(self, name: str, radius: int) -> None:
@@ -192,17 +192,17 @@ class KinetConfig:
 
     @property
     def static_radius(self) -> int:
-        """The number of frames before and after that the static stream's neighborhoods reach."""
+        """Returns the number of frames before and after that the static stream's neighborhoods reach."""
         return self.temporal_radius if self.static_temporal_radius is None else self.static_temporal_radius
 
     @property
     def own_static_groups(self) -> bool:
-        """True where the static stream has neighborhoods of its own."""
+        """Returns whether the static stream has neighborhoods of its own."""
         return self.static_radius != self.temporal_radius
 
     @property
     def dynamic_head(self) -> tuple[int, int]:
-        """The widths of the two layers of the dynamic branch's head."""
+        """Returns the widths of the two layers of the dynamic branch's head."""
         return self.head or self.widths[-1]
 
     @classmethod

@@ -27,7 +27,7 @@ class Forest(nn.Module):
 
     @classmethod
     def grown(cls, forest: Any, nodes: int, classes: int) -> Forest:
-        """Returns a fitted forest of scikit-learn; nodes: room for each tree, at least the most that one of them has."""
+        """Returns a fitted forest of scikit-learn; nodes: allocated for each tree, at least the most that one of them has."""
         made = cls(len(forest.estimators_), nodes, classes)
         for number, one in enumerate(forest.estimators_):
             tree, count = one.tree_, one.tree_.node_count

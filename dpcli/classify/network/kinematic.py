@@ -82,7 +82,7 @@ class KinematicUnit(nn.Module):
 
     @property
     def channels(self) -> int:
-        """The width of `Surface.normals`."""
+        """Returns the width of `Surface.normals`."""
         return self.groups * (self.config.group_size + 1)
 
     def forward(

@@ -91,8 +91,11 @@ def _fast(activation: Tensor, size: int) -> bool:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Columns of the reduced features as the kernels want them: feature after feature, each over all groups, whose number
-    is filled up to a multiple of _LANES. The group of coordinates, if any, follows the learned ones."""
+    """Describes the columns of the reduced features as the kernels want them.
+
+    They go feature after feature, each over all groups, whose number is filled up to a multiple of _LANES. The group of
+    coordinates, if any, follows the learned ones.
+    """
 
     learned: int
     coordinates: bool
@@ -100,26 +103,26 @@ class _Layout:
 
     @property
     def used(self) -> int:
-        """The number of groups that hold something."""
+        """Returns the number of groups that hold something."""
         return self.learned + self.coordinates
 
     @property
     def groups(self) -> int:
-        """The number of groups, those included that only fill up."""
+        """Returns the number of groups, those included that only fill up."""
         return -(-self.used // _LANES) * _LANES
 
     @property
     def width(self) -> int:
-        """The number of columns of a row of features."""
+        """Returns the number of columns of a row of features."""
         return self.size * self.groups
 
     @property
     def entries(self) -> int:
-        """Numbers a fit is made of: half the normal matrix, and the right side."""
+        """Returns how many numbers a fit is made of: half the normal matrix, and the right side."""
         return (self.size + 1) * (self.size + 2) // 2 + self.size + 1
 
     def spread(self, rows: Tensor) -> Tensor:
-        """Rows (L*d,...) of learned features, group after group, as (width,...); zeros elsewhere. Differentiable."""
+        """Returns rows (L*d,...) of learned features, group after group, as (width,...); zeros elsewhere. Differentiable."""
         columns = torch.full((self.size, self.groups), len(rows))
         columns[:, : self.learned] = torch.arange(len(rows)).view(self.learned, self.size).t()
         return torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])[columns.view(-1)]
@@ -168,7 +171,7 @@ class _Case:
         return slice(low * self.neighbors, high * self.neighbors)
 
     def made(self, centroids: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns room for the features, weights and moments of so many centroids."""
+        """Returns buffers for the features, weights and moments of so many centroids."""
         rows, groups = centroids * self.neighbors, self.layout.groups
         weights = torch.empty(rows if len(self.logits) else 0, groups)
         return torch.empty(rows, self.layout.width), weights, torch.empty(centroids, self.layout.entries, groups)
@@ -312,7 +315,7 @@ class _Gradients:
         self.moved, self.groups = np.empty(case.step * case.layout.groups, np.bool_), case.layout.groups
 
     def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns room for the gradients of so many centroids' planes, normal matrices and right sides, and for which of
+        """Returns buffers for the gradients of so many centroids' planes, normal matrices and right sides, and for which of
         their determinants a guard moved."""
         numbers = count * self.size
         return (

@@ -42,7 +42,7 @@ class ReadAhead:
 
     @property
     def waiting(self) -> int:
-        """Frames that have arrived and were not taken yet."""
+        """Returns the number of frames that have arrived and were not taken yet."""
         return self._queue.qsize()
 
     def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float, float]]:

@@ -40,7 +40,7 @@ class Window:
 
     @property
     def frame_counts(self) -> list[int]:
-        """The frames of each video, as a reader says them: of this one, those so far."""
+        """Returns the number of frames of each video, as a reader does: of this one video, those seen so far."""
         return [self.count]
 
     def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
@@ -132,7 +132,7 @@ class StreamPredictor:
 
     @property
     def mean(self) -> np.ndarray:
-        """The probabilities f32 (1+S,C) averaged over all clips so far."""
+        """Returns the probabilities f32 (1+S,C) averaged over all clips so far."""
         return (self._sum / max(self.clips, 1)).astype(np.float32)
 
     def clip(self) -> Clip:

@@ -44,7 +44,7 @@ class EpochBatches:
 
     @property
     def draws(self) -> int:
-        """The number of draws of every clip that the stage comes back to; 0 where each epoch has its own."""
+        """Returns the number of draws of every clip that the stage comes back to; 0 where each epoch has its own."""
         return min(self.schedule.draws, self.schedule.epochs_dynamic) if self.stage == 1 else 0
 
     def load(self, epoch: int, first: int) -> Iterator[Batch]:

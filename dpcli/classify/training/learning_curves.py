@@ -16,7 +16,7 @@ _ACCURACIES = (
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """Write loss (left axis) and accuracies in % (right axis) of every stage, over epochs, as a PNG."""
+    """Writes loss (left axis) and accuracies in % (right axis) of every stage, over epochs, as a PNG."""
     panels = [
         Panel(
             f"{stage} stream",

@@ -66,7 +66,7 @@ class Schedule:
 
     @property
     def stage_epochs(self) -> tuple[int, int]:
-        """The epochs of both stages: static, dynamic."""
+        """Returns the epochs of both stages: static, dynamic."""
         return self.epochs, self.epochs_dynamic
 
     def share(self, processes: int) -> int:

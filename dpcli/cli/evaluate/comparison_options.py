@@ -41,7 +41,7 @@ class ComparisonOptions:
     split: Split = None
 
     def options(self, *, intersect: bool = False) -> EvaluationOptions:
-        """Returns the options as the comparison takes them. UsageError where `--metrics` names none."""
+        """Returns the options as the comparison takes them. Raises UsageError where `--metrics` names none."""
         from dpcli.evaluate.compare.file_metrics import EvaluationOptions
 
         return EvaluationOptions(

@@ -96,7 +96,7 @@ class IntervalOptions:
 
     @property
     def resampling(self) -> Resampling:
-        """The settings of the bootstrap. UsageError where they make no interval."""
+        """Returns the settings of the bootstrap. Raises UsageError where they make no interval."""
         from dpcli.evaluate.bootstrap import Resampling
 
         return Resampling(self.resamples, self.confidence, self.seed)
@@ -115,7 +115,7 @@ class KeepOptions:
     force: Force = False
 
     def keeping(self, spread: SpreadOptions) -> Keeping:
-        """The choice as the commands take it. UsageError for a shard without a file."""
+        """Returns the choice as the commands take it. Raises UsageError for a shard without a file."""
         from dpcli.evaluate.segmentation.sequence_pass import Keeping
 
         return Keeping(self.output, spread.spread, self.force)
@@ -123,7 +123,7 @@ class KeepOptions:
 
 @dataclass(frozen=True)
 class FormOptions:
-    """Says in which form a result is printed. UsageError for two forms at once."""
+    """Says in which form a result is printed. Raises UsageError for two forms at once."""
 
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as markdown.")] = False
     as_object: Json = False

@@ -69,7 +69,7 @@ class ArticulationOptions:
     ] = False
 
     def articulation(self, conversion: ConversionOptions) -> Articulation:
-        """Returns these options, with the number of points, as the room takes them."""
+        """Returns these options, with the number of points, as `dpcli.prepare` takes them."""
         from dpcli.prepare.articulated.articulated_sequence import Articulation
 
         return Articulation(points_per_frame=conversion.points, sampling=conversion.sampling, **vars(self))

@@ -22,22 +22,22 @@ _TEMPLATE, _DATA_STYLE = "web/page.html", "web/data.css"
 
 
 def source_text(name: str, package: str = __package__) -> str:
-    """Return a template, style sheet or script that lies beside the code of `package`."""
+    """Returns a template, style sheet or script that lies beside the code of `package`."""
     return files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def script_text(names: Sequence[str], package: str = __package__) -> str:
-    """Return several scripts of `package` as one text, in the order of their names."""
+    """Returns several scripts of `package` as one text, in the order of their names."""
     return "\n".join(source_text(name, package) for name in names)
 
 
 def filled(template: str, marks: Mapping[str, str]) -> str:
-    """Replace every `<!--MARK-->` of the template. Contents are not searched again, so no content can bring a mark in."""
+    """Replaces every `<!--MARK-->` of the template. Contents are not searched again, so no content can bring a mark in."""
     return _MARK.sub(lambda found: marks[found[1]], template)
 
 
 def as_json(header: Any) -> str:
-    """Spell a value as JSON that may stand within a `<script>`: it holds no `<`, so nothing in it can end the script."""
+    """Returns a value as JSON that may stand within a `<script>`: it holds no `<`, so nothing in it can end the script."""
     return json.dumps(_spelled(header), allow_nan=False, sort_keys=True).replace("<", "\\u003c")
 
 
@@ -56,14 +56,14 @@ def as_base64(data: bytes) -> str:
 
 
 def data_blocks(blocks: Sequence[bytes]) -> str:
-    """Return binary data as elements with the ids data0, data1, ...; a script unpacks one when it needs it."""
+    """Returns binary data as elements with the ids data0, data1, ...; a script unpacks one when it needs it."""
     return "\n".join(
         f'<script type="text/plain" id="data{at}">{as_base64(block)}</script>' for at, block in enumerate(blocks)
     )
 
 
 def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], data: str = "") -> str:
-    """Return a page about one file.
+    """Returns a page about one file.
 
     header: values for the script, among them `title`. name: of the page: NAME.html is its middle, and the style sheet knows it.
     script: names of the page's own scripts, in their order. data: HTML of the elements that hold further data.
@@ -83,7 +83,7 @@ def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], da
 
 
 def write_page(page: str, path: Path) -> int:
-    """Write a page whole or not at all; return its size in bytes. DataError when it can't be written."""
+    """Writes a page whole or not at all and returns its size in bytes. Raises DataError when it can't be written."""
     content = page.encode("utf-8", "replace")
     write_whole(path, content)
     return len(content)

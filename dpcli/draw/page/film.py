@@ -17,7 +17,7 @@ _QUALITY = 82  # of WebP; its transparency loses nothing
 
 @dataclass
 class PageView:
-    """One camera: a title, and its pictures u8 (H,W,4) with straight alpha, which are taken one at a time."""
+    """Holds one camera: a title, and its pictures u8 (H,W,4) with straight alpha, which are taken one at a time."""
 
     title: str
     pictures: Iterable[np.ndarray]
@@ -26,7 +26,7 @@ class PageView:
 def film_page(
     facts: PageFacts, views: Iterable[PageView], *, frames: Sequence[int], frame_count: int, time: np.ndarray, side: int
 ) -> str:
-    """Return the page. frames: numbers of the pictures' frames, of frame_count in all. time: f64 of these frames, seconds.
+    """Returns the page. frames: numbers of the pictures' frames, of frame_count in all. time: f64 of these frames, seconds.
 
     Pictures are reduced so that their longer side has at most `side` pixels, and stored as WebP.
     """
@@ -46,7 +46,7 @@ def film_page(
 
 
 def _webp(rgba: np.ndarray, side: int) -> str:
-    """Return the address, `data:...`, of a picture: letters, digits and + / = only, so it may stand in an attribute."""
+    """Returns the address, `data:...`, of a picture: letters, digits and + / = only, so it may stand in an attribute."""
     from PIL import Image
 
     picture = Image.fromarray(rgba)

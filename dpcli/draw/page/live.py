@@ -14,7 +14,7 @@ from dpcli.draw.palette import part_colors
 
 
 class Stretch(Protocol):
-    """A stretch of frames, `start` to `end` (one past the last), and the name of what it shows, "" for nothing."""
+    """Describes a stretch of frames, `start` to `end` (one past the last), and the name of what it shows, "" for nothing."""
 
     start: int
     end: int

@@ -22,7 +22,7 @@ _STOPS, _USUAL_RATE, _RATES = 12, 10.0, (1.0, 60.0)  # colors of the ramp; frame
 
 @dataclass
 class PageSequence:
-    """One sequence as a page shows it, its frames already thinned.
+    """Holds one sequence as a page shows it, its frames already thinned.
 
     title: in the list of sequences. frames: number of each shown frame within the sequence, of frame_count in all. time: f64
     of the shown frames in seconds, or None. points: a frame's points each, f32 (N,3), x right, y up, z towards the viewer.
@@ -51,7 +51,7 @@ class PageFacts:
     history: list[dict[str, Any]] = field(default_factory=list)
 
     def header(self) -> dict[str, Any]:
-        """Return the values that the script of every page reads."""
+        """Returns the values that the script of every page reads."""
         history = [{"command": str(entry.get("command", ""))} for entry in self.history]
         return {
             "title": self.title,
@@ -63,24 +63,24 @@ class PageFacts:
 
 
 def spread(count: int, most: int) -> np.ndarray:
-    """Return at most `most` of the numbers 0..count-1, evenly spread, i64; all of them where they are few enough."""
+    """Returns at most `most` of the numbers 0..count-1, evenly spread, i64; all of them where they are few enough."""
     if count <= most:
         return np.arange(count)
     return np.linspace(0, count - 1, most).round().astype(np.int64)
 
 
 def frame_budget(sequences: int) -> int:
-    """Return how many frames of each of so many sequences a page shows."""
+    """Returns how many frames of each of so many sequences a page shows."""
     return int(np.clip(MOST_FRAMES // max(sequences, 1), _FEWEST_FRAMES, _MOST_IN_SEQUENCE))
 
 
 def point_budget(frames: int) -> int:
-    """Return how many points of each of so many frames a page shows."""
+    """Returns how many points of each of so many frames a page shows."""
     return int(np.clip(MOST_POINTS // max(frames, 1), _FEWEST_POINTS, _MOST_IN_FRAME))
 
 
 def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np.ndarray, unit: str) -> str:
-    """Return the page. axes: f (3,3), row k is where the file's axis k points on the page. unit: of length, "" = unknown.
+    """Returns the page. axes: f (3,3), row k is where the file's axis k points on the page. unit: of length, "" = unknown.
 
     Positions are rounded to 1/65535 of the box around their sequence. Equal input gives an equal page.
     """
@@ -91,7 +91,7 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
 def points_parts(
     facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np.ndarray, unit: str
 ) -> tuple[dict[str, Any], list[bytes]]:
-    """Return the header of a page with point clouds, and the block of each sequence; arguments as of `points_page`."""
+    """Returns the header of a page with point clouds, and the block of each sequence; arguments as of `points_page`."""
     header = facts.header() | {
         "axes": axes.tolist(),
         "unit": unit,
@@ -106,7 +106,7 @@ def points_parts(
 
 
 def _looks(sequences: Sequence[PageSequence]) -> list[str]:
-    """Return the ways to color the points that the data allow, the most telling one first."""
+    """Returns the ways to color the points that the data allow, the most telling one first."""
     first = sequences[0]
     parted, colored = first.part is not None, first.color is not None
     label = any(sequence.label >= 0 for sequence in sequences)
@@ -116,7 +116,7 @@ def _looks(sequences: Sequence[PageSequence]) -> list[str]:
 
 
 def _ramp() -> list[list[int]]:
-    """Return colors from low to high, without the ends that vanish on a dark or a light ground."""
+    """Returns colors from low to high, without the ends that vanish on a dark or a light ground."""
     from matplotlib import colormaps
 
     return np.rint(colormaps["turbo"](np.linspace(0.1, 0.92, _STOPS))[:, :3] * 255).astype(int).tolist()
@@ -143,7 +143,7 @@ def _described(sequence: PageSequence) -> dict[str, Any]:
 
 
 def _steps(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest corner and the step (3) of positions rounded to 16 bits; a step is never 0."""
+    """Returns the lowest corner and the step (3) of positions rounded to 16 bits; a step is never 0."""
     if not len(points):
         return np.zeros(3), np.ones(3)
     low = points.min(0)
@@ -151,7 +151,7 @@ def _steps(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frame_rate(time: np.ndarray | None) -> float:
-    """Return frames per second: as the times say, within what a screen shows and a person waits for."""
+    """Returns the frames per second that the times give, limited to what a screen shows and a person waits for."""
     if time is None or len(time) < 2 or not np.isfinite(time).all():
         return _USUAL_RATE
     interval = float(np.median(np.diff(time)))
@@ -159,7 +159,7 @@ def frame_rate(time: np.ndarray | None) -> float:
 
 
 def _ids(sequence: PageSequence) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part ids of a sequence, rising, and their counts; of more than a byte tells, those with the most points."""
+    """Returns the part ids of a sequence, ascending, and their counts; of more than 254, those with the most points."""
     ids, counts = np.unique(np.concatenate(sequence.part), return_counts=True)
     if len(ids) > _MOST_PARTS:
         kept = np.sort(np.argsort(-counts, kind="stable")[:_MOST_PARTS])
@@ -186,7 +186,7 @@ def _percent(share: float) -> str:
 
 
 def _packed(sequence: PageSequence) -> bytes:
-    """Return u8 planes: low and high bytes of x, of y, of z (6 N), then the place of the part in the list (N), r, g, b (3 N)."""
+    """Returns u8 planes: low and high bytes of x, of y, of z (6 N), the place of the part in the list (N), r, g, b (3 N)."""
     points = np.concatenate(sequence.points).astype(np.float64) if sequence.points else np.zeros((0, 3))
     low, step = _steps(points)
     steps = np.rint((points - low) / step).clip(0, _STEPS).astype(np.uint16).T
@@ -199,7 +199,7 @@ def _packed(sequence: PageSequence) -> bytes:
 
 
 def _places(sequence: PageSequence) -> np.ndarray:
-    """Return where each point's part stands in the list; ids that are not listed count as none."""
+    """Returns where each point's part stands in the list; ids that are not listed count as none."""
     listed = [one["id"] for one in _part_list(sequence)]
     given = np.concatenate(sequence.part)
     order = np.argsort(listed, kind="stable")

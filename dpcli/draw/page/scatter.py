@@ -20,7 +20,7 @@ def scatter_page(
     labels: np.ndarray,
     planes: Mapping[str, tuple[np.ndarray, Mapping[str, float]]],
 ) -> str:
-    """Return the page. labels: i (S), -1 = unknown. planes: by stream, places f (S,2) without unit, and figures by name."""
+    """Returns the page. labels: i (S), -1 = unknown. planes: by stream, places f (S,2) without unit, and figures by name."""
     kept = spread(len(names), MOST_DOTS)
     if len(kept) < len(names):
         facts.notes.append(f"Showing {len(kept):,} of {len(names):,} samples, evenly spread.")

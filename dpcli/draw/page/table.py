@@ -28,7 +28,7 @@ def scores_page(
     splits: Sequence[str],
     streams: Mapping[str, np.ndarray],
 ) -> str:
-    """Return the page. labels: i (S), -1 = unknown. scores: f (S,C). streams: further scores (S,C) by name, such as static.
+    """Returns the page. labels: i (S), -1 = unknown. scores: f (S,C). streams: further scores (S,C) by name, such as static.
 
     The first 5,000 samples become rows; the counts of right ones are of all samples. Scores that are no probabilities (each row
     positive with sum 1) are called scores.
@@ -51,7 +51,7 @@ def _are_probabilities(scores: np.ndarray) -> bool:
 
 
 def _tally(scores: np.ndarray, labels: np.ndarray) -> list[int]:
-    """Return how many samples are right, of how many whose label is known."""
+    """Returns how many samples are right, of how many whose label is known."""
     known = labels >= 0
     return [int((scores[known].argmax(1) == labels[known]).sum()), int(known.sum())] if scores.size else [0, 0]
 

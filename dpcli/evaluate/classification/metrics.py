@@ -130,7 +130,7 @@ def _check(scores: np.ndarray, labels: np.ndarray) -> None:
 
 
 def classification_merge(parts: Iterable[ClassificationStatistics]) -> ClassificationStatistics:
-    """Returns the statistics of all parts together, equal to those of all samples at once. DataError without parts."""
+    """Returns the statistics of all parts together, equal to those of all samples at once. Raises DataError without parts."""
     parts = list(parts)
     if not parts:
         raise DataError("no statistics to merge: evaluate at least one shard")

@@ -47,7 +47,7 @@ class ClassificationReport:
 
     @property
     def accepted(self) -> tuple[int, int] | None:
-        """The numbers of samples not rejected and, by the main scores, of those of them that are right; None: none could be."""
+        """Returns how many samples are not rejected and how many of those the main scores get right; None: none could be."""
         if self.rejected is None:
             return None
         kept = ~self.rejected
@@ -55,7 +55,7 @@ class ClassificationReport:
 
     @property
     def main(self) -> ClassificationMetrics:
-        """The metrics of the main scores."""
+        """Returns the metrics of the main scores."""
         return list(self.streams.values())[-1]
 
 

@@ -11,7 +11,7 @@ from dpcli.store import input_file
 
 
 def open_files(stack: ExitStack, arguments: Sequence[str]) -> list[Path]:
-    """Returns a readable path for each argument, `-` for a pipe, until `stack` closes. UsageError for two pipes."""
+    """Returns a readable path for each argument, `-` for a pipe, until `stack` closes. Raises UsageError for two pipes."""
     if list(arguments).count("-") > 1:
         raise UsageError("-: a pipe holds one file; name the others")
     return [stack.enter_context(input_file(argument)) for argument in arguments]

@@ -30,7 +30,7 @@ def list_weights(folder: Path | None) -> Result:
 def check_named_weights(names: Sequence[str], folder: Path | None) -> Result:
     """Returns whether the named weights, or all that are in the folder, are whole, by their digests.
 
-    The result is incomplete where one is damaged, or named and absent. UsageError for a name there isn't.
+    The result is incomplete where one is damaged, or named and absent. Raises UsageError for a name there isn't.
     """
     place = weights_folder(folder)
     entries = [weights_named(name) for name in names] if names else list(known_weights().values())
@@ -43,7 +43,7 @@ def check_named_weights(names: Sequence[str], folder: Path | None) -> Result:
 
 
 def choose_weights(names: Sequence[str], everything: bool) -> list[Weights]:
-    """Returns the named weights, or all of them. UsageError for neither or both, and for a name there isn't."""
+    """Returns the named weights, or all of them. Raises UsageError for neither or both, and for a name there isn't."""
     if bool(names) == everything:
         raise UsageError(f"name the weights, or give --all: {', '.join(known_weights())}")
     return list(known_weights().values()) if everything else [weights_named(name) for name in names]

@@ -102,7 +102,7 @@ def metrics_of_values(
 ) -> FileMetrics:
     """Returns the metrics of a table {sample name: {metric: value}}, which are means over the samples (pictures, views).
 
-    must_equal: as in `FileMetrics`. NaN = the sample doesn't count. DataError without a sample, and naming those with an
+    must_equal: as in `FileMetrics`. NaN = the sample doesn't count. Raises DataError without a sample, and naming those with an
     infinite value.
     """
     names = list(values)

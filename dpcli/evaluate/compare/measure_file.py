@@ -32,7 +32,7 @@ _ROWS = 256
 
 
 def kind_of_file(path: Path, source: str) -> str:
-    """Returns scores, parts or video. source: how the path was named, for the message. DataError for another kind of file."""
+    """Returns scores, parts or video. source: the path as named, for the message. Raises DataError for another kind of file."""
     kind = "views" if is_media(path) else file_kind(path)
     if kind not in ("scores", "parts", *_VIDEO_FILES):
         raise DataError(

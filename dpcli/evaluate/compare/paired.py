@@ -46,7 +46,7 @@ class Change:
 
     @property
     def difference(self) -> float:
-        """The value of A less that of B, in `unit`."""
+        """Returns the value of A less that of B, in `unit`."""
         return self.a - self.b
 
 
@@ -84,7 +84,7 @@ def evaluate_compare(
     resampling: Resampling,
     sources: tuple[str, str] | None = None,
 ) -> CompareReport:
-    """Compares two scores files, or two parts files or videos with a truth. DataError where they aren't of the same samples.
+    """Compares two scores files, parts files or videos with a truth. Raises DataError where they aren't of the same samples.
 
     sources: how the files were named, for messages.
     """
@@ -128,7 +128,7 @@ def compare_metrics(
 def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, intersect: bool = False) -> Paired:
     """Compares the metrics of two predictions of one task.
 
-    DataError when tasks, units or facts differ, when a sample isn't the same on both sides, or when the samples differ
+    Raises DataError when tasks, units or facts differ, when a sample isn't the same on both sides, or when the samples differ
     (with `intersect` the common ones are compared and the rest listed).
     """
     _check_facts(a, b)

@@ -56,7 +56,7 @@ class RunsReport:
 
     @property
     def spreads(self) -> dict[str, Spread]:
-        """The spread over runs of each metric; undefined where a run has no number."""
+        """Returns the spread over runs of each metric; undefined where a run has no number."""
         columns = {key: [run.metrics[key] for run in self.runs] for key in self.units}
         return {
             key: mean_with_t_interval(
@@ -95,7 +95,7 @@ def evaluate_runs(
     """Evaluates several files in the same way: scores files, parts files, or files of JSON objects, one a line, that
     `dpc evaluate ... --json` printed.
 
-    DataError when they are of different kinds, tasks, protocols, units or samples.
+    Raises DataError when they are of different kinds, tasks, protocols, units or samples.
     """
     runs = [
         run

@@ -29,7 +29,7 @@ class Clip:
     def load(cls, folder: Path, variant: str = "openai", device: str = "cpu") -> Clip:
         """Loads `openai`, or `laion` (trained on LAION-2B), from the weights folder.
 
-        DataError when the files are absent or damaged; DpcError without `transformers`; UsageError for another variant.
+        Raises DataError when the files are absent or damaged; DpcError without `transformers`; UsageError for another variant.
         """
         if variant not in VARIANTS:
             raise UsageError(f"CLIP variant {variant!r}: expected one of {', '.join(VARIANTS)}")
@@ -57,7 +57,7 @@ class Clip:
     ) -> np.ndarray:  # f32 [B, width]
         """Returns unit embeddings of RGB pictures; floats in 0..1 are rounded to 8 bits, as CLIP's preprocessing sees files.
 
-        bgr: swap red and blue first, as 4DGen's reader did by mistake. DataError as `preprocess`.
+        bgr: swap red and blue first, as 4DGen's reader did by mistake. Raises DataError as `preprocess`.
         """
         import torch
 
@@ -88,7 +88,7 @@ def preprocess(
 ) -> np.ndarray:  # f32 [B, 3, side, side]
     """Returns RGB pictures as CLIP sees them: short side to `side` (Pillow's bicubic), center square, colors normalized.
 
-    DataError for floats that are not finite or not in 0..1; ValueError for another shape.
+    Raises DataError for floats that are not finite or not in 0..1; ValueError for another shape.
     """
     if pictures.ndim != 4 or pictures.shape[3] != 3:
         raise ValueError(f"pictures of shape {pictures.shape}; expected (B,H,W,3)")
@@ -125,7 +125,7 @@ def _center(picture: np.ndarray, side: int) -> np.ndarray:
 
 
 def cosines(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Returns the cosine of each pair of embeddings f (...,D), f64 (...). DataError for one without direction, or not finite.
+    """Returns the cosine of each pair of embeddings f (...,D), f64 (...). Raises DataError for a zero or non-finite one.
 
     >>> cosines(np.array([[1.0, 0.0]]), np.array([[3.0, 4.0]])).round(3).tolist()
     [0.6]
@@ -144,19 +144,19 @@ def spherical(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def clip_similarity(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Returns Consistent4D's CLIP score: the mean cosine of frames with their truth, embeddings f (T,D). DataError for no frames."""
+    """Returns Consistent4D's CLIP score: mean cosine of frames with their truth, f (T,D). Raises DataError for T = 0."""
     return float(cosines(*_some(predicted, truth)).mean())
 
 
 def clip_spherical(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Returns 4DGen's CLIP score: the mean spherical distance of frames to their truth, embeddings f (T,D). DataError for none."""
+    """Returns 4DGen's CLIP score: mean spherical distance of frames to their truth, f (T,D). Raises DataError for T = 0."""
     return float(spherical(*_some(predicted, truth)).mean())
 
 
 def clip_across_views(
     embeddings: np.ndarray,  # [V, T, D]
 ) -> float:
-    """Returns the mean cosine over all pairs of views at the same time (thesis, section C.1.4). DataError for less than two views."""
+    """Returns the mean cosine over pairs of views at one time (thesis, C.1.4). Raises DataError for fewer than two views."""
     views = len(embeddings)
     if embeddings.ndim != 3 or views < 2 or embeddings.shape[1] < 1:
         raise DataError(f"CLIP across views needs two views or more, (V,T,D), but was given {embeddings.shape}")
@@ -167,7 +167,7 @@ def clip_across_views(
 def clip_temporal(
     embeddings: np.ndarray,  # [T, D]
 ) -> float:
-    """Returns the mean cosine of consecutive frames of one view. DataError for less than two frames."""
+    """Returns the mean cosine of consecutive frames of one view. Raises DataError for fewer than two frames."""
     if embeddings.ndim != 2 or len(embeddings) < 2:
         raise DataError(f"CLIP over time needs two frames or more, (T,D), but was given {embeddings.shape}")
     return float(cosines(embeddings[1:], embeddings[:-1]).mean())

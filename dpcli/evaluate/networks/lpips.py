@@ -25,7 +25,7 @@ class Lpips(nn.Module):
     """Computes the distance, 0 for equal pictures; a trained head weighs the squared difference of each unit feature.
 
     A new object has random trunk weights (for tests) and the published heads; `Lpips.load` has both published.
-    Values of different nets are on different scales: never mix them. UsageError for an unknown net.
+    Values of different nets are on different scales: never mix them. Raises UsageError for an unknown net.
     """
 
     def __init__(self, net: str = "vgg"):
@@ -41,7 +41,7 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, net: str, folder: Path) -> Lpips:
-        """Loads the published trunk from the weights folder. DataError when it is absent, damaged or another network's."""
+        """Loads the published trunk from the weights folder. Raises DataError when absent, damaged or another network's."""
         made = cls(net)
         name = NETS[net][1]
         fill_module(made.trunk, load_weights(name, folder), find_weights(name, folder))
@@ -60,7 +60,7 @@ class Lpips(nn.Module):
 
         spatial: a map of the pictures' size (each layer's, bilinear) instead of the sum of the layers' means.
         range01_mistake: DisCo's evaluation gives the network 0..1 where it expects -1..1; for its published numbers.
-        DataError for values that are not finite or not in 0..1, and for pictures under the trunk's `smallest`.
+        Raises DataError for values that are not finite or not in 0..1, and for pictures under the trunk's `smallest`.
         """
         maps = self.layer_maps(a, b, range01_mistake=range01_mistake)
         if not spatial:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def load_weights(name: str, folder: Path) -> dict[str, torch.Tensor]:
-    """Returns the state dict of the weights `name`. DataError when absent, damaged, or not a plain state dict.
+    """Returns the state dict of the weights `name`. Raises DataError when absent, damaged, or not a plain state dict.
 
     The size is compared, and the digest of a TorchScript archive, which holds code.
     """
@@ -30,7 +30,7 @@ def load_tensors(path: Path, script: bool = False) -> dict[str, torch.Tensor]:
     """Returns the tensors of a .safetensors, .pth, .pt or .bin file by name, on the CPU; nothing else is unpickled.
 
     A training checkpoint's `state_dict` is taken, and the prefix `module.` of parallel training dropped.
-    script: the file is a TorchScript archive. DataError for anything else, and for weights that are not finite.
+    script: the file is a TorchScript archive. Raises DataError for anything else, and for weights that are not finite.
     """
     state = _tensors(_read(path, script))
     if state is None:
@@ -76,7 +76,7 @@ def _tensors(found: Any) -> dict[str, torch.Tensor] | None:
 def fill_module(module: torch.nn.Module, state: dict[str, torch.Tensor], path: Path) -> None:
     """Puts `state` into `module`; names that it doesn't have are left alone (a classifier's last layers, say).
 
-    DataError when one of its own is missing, or has another shape. Batch norm's step counters may be missing.
+    Raises DataError when one of its own is missing, or has another shape. Batch norm's step counters may be missing.
     """
     taken = {}
     for name, own in module.state_dict().items():

@@ -46,7 +46,7 @@ class Weights:
 
     @property
     def files(self) -> tuple[Weights, ...]:
-        """This file and those it needs beside it."""
+        """Returns this file and those it needs beside it."""
         return (self, *self.beside)
 
 
@@ -72,7 +72,7 @@ def _entry(name: str, fields: dict[str, Any]) -> Weights:
 
 
 def weights_named(name: str) -> Weights:
-    """Returns one entry of the list, by its name or its file's. UsageError for another name."""
+    """Returns one entry of the list, by its name or its file's. Raises UsageError for another name."""
     for weights in known_weights().values():
         if name in (weights.name, weights.file):
             return weights

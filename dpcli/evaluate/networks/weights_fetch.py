@@ -20,7 +20,7 @@ _AGENT = {"User-Agent": "dpc"}  # some hosts refuse urllib's own
 def fetch_weights(weights: Weights, folder: Path) -> list[Path]:
     """Downloads an entry's files into `folder`, each beside its place, checked, then renamed; whole ones are kept.
 
-    DpcError when a file can't be had (no network, refused); DataError when what came isn't the published file.
+    Raises DpcError when a file can't be had (no network, refused); DataError when what came isn't the published file.
     """
     for each in weights.files:
         _fetch_file(each, folder / each.file)

@@ -18,7 +18,7 @@ from dpcli.evaluate.report.thesis_tables import beside_table, choose_tables
 def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[str] = ()) -> Report:
     """Returns the report of all results. beside: ids of the thesis's tables, none = those that know the data.
 
-    DataError when a result's numbers have no shape that can be shown; UsageError for a table there isn't.
+    Raises DataError when a result's numbers have no shape that can be shown; UsageError for a table there isn't.
     """
     objects = [result.found for result in collected.results]
     tables = choose_tables(beside, objects)

@@ -69,7 +69,7 @@ def _class_table(classes: list[Mapping[str, Any]]) -> Table:
 
 
 def _confusion_matrix(found: Any, classes: int) -> np.ndarray | None:
-    """Returns the confusion matrix, i64 (C,C); None without one. DataError unless it is square, of counts, of all classes."""
+    """Returns the confusion matrix, i64 (C,C); None without one. Raises DataError unless it is square and has all classes."""
     if found is None:
         return None
     try:

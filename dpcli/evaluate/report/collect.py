@@ -54,7 +54,7 @@ def collect(
     """Returns the results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
 
     truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
-    result (clouds, strips). Equal objects count once. DataError for a file that holds no result, UsageError for no
+    result (clouds, strips). Equal objects count once. Raises DataError for a file that holds no result, UsageError for no
     arguments or a pipe named twice.
     """
     if not arguments:
@@ -138,7 +138,7 @@ def _objects_in_text(text: str, source: str) -> list[tuple[Any, str]]:
 
 
 def _strict_json(text: str) -> Any:
-    """Returns what JSON says. ValueError for NaN and Infinity, which no result has."""
+    """Returns what JSON says. Raises ValueError for NaN and Infinity, which no result has."""
 
     def refuse(name: str) -> None:
         raise ValueError(f"{name} is no number")

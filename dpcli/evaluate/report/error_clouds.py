@@ -36,7 +36,7 @@ class SequenceError:
 
     @property
     def mean(self) -> float:
-        """The mean over frames of the mIoU; NaN = undefined."""
+        """Returns the mean over frames of the mIoU; NaN = undefined."""
         return mean_defined(self.iou)
 
 

@@ -50,7 +50,7 @@ class ThesisTable:
 
     @property
     def id(self) -> str:
-        """The name by which `--beside` asks for the table, such as table-3.4."""
+        """Returns the name by which `--beside` asks for the table, such as table-3.4."""
         return f"table-{self.number}"
 
     def numbers(self) -> list[ThesisRow]:
@@ -92,7 +92,7 @@ def thesis_tables() -> tuple[ThesisTable, ...]:
 def choose_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -> list[ThesisTable]:
     """Returns the tables asked for by id (`table-3.4`; `none` = no table), else those that know one of the results.
 
-    Ablations only stand beside a result when they are asked for. UsageError for ids there aren't.
+    Ablations only stand beside a result when they are asked for. Raises UsageError for ids there aren't.
     """
     known = {own.id: own for own in thesis_tables()}
     if beside:

@@ -17,7 +17,7 @@ _INSTANTS, _MOST_VIEWS, _QUALITY = 6, 4, 82
 
 
 def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", background: str | None = None) -> Figure:
-    """Returns pictures of up to four views; reads, or renders, only the frames it shows. DataError as `evaluate_video`."""
+    """Returns pictures of up to four views; reads or renders only those shown. Raises DataError as `evaluate_video`."""
     from dpcli.evaluate.choices import BACKGROUNDS
     from dpcli.evaluate.video.difference_strip import DifferenceStrip
     from dpcli.evaluate.video.protocol import video_protocol

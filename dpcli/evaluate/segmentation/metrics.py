@@ -88,7 +88,7 @@ def segmentation_update(
     """Returns the statistics of one object, given its frames. True parts of fewer than `ignore_below` points are ignored.
 
     Frames without a true part that counts are skipped; protocol `release` (see `match_parts`, `mean_iou`) can't skip
-    them: DataError. ValueError for another protocol.
+    them and raises DataError. Raises ValueError for another protocol.
     """
     options = {"ignore_below": ignore_below, "release": _is_release(protocol)}
     matches: list[FrameMatch] = []
@@ -124,7 +124,7 @@ def _is_release(protocol: str) -> bool:
 
 
 def segmentation_merge(parts: Iterable[SegmentationStatistics]) -> SegmentationStatistics:
-    """Returns the statistics of all parts together, equal to those of all objects at once. DataError without parts."""
+    """Returns the statistics of all parts together, equal to those of all objects at once. Raises DataError without parts."""
     parts = list(parts)
     if not parts:
         raise DataError("no statistics to merge: evaluate at least one sequence")
@@ -179,7 +179,7 @@ def _floored_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
 
 
 def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dpc") -> SegmentationMetrics:
-    """Returns the metrics that statistics stand for. ValueError for an unknown protocol.
+    """Returns the metrics that statistics stand for. Raises ValueError for an unknown protocol.
 
     `release` keeps the order of the predictions where confidences are equal (`dpc` counts them together), and takes 0/0
     as 0 (see `part_scores`).
@@ -206,7 +206,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
 def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol: str = "dpc") -> WeightedMetric:
     """Returns ap, pq, f1, pre, rec, miou and ri as functions of how often each sequence counts.
 
-    sequences: the statistics of each one. ValueError for an unknown protocol.
+    sequences: the statistics of each one. Raises ValueError for an unknown protocol.
     """
     whole = segmentation_merge(sequences)
     sequence = np.repeat(np.arange(len(sequences)), [len(one.iou) for one in sequences])

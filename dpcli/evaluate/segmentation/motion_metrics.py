@@ -82,7 +82,7 @@ class MotionMetrics:
 def end_point_errors(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Returns the end-point error (EPE) of each point, f64 (N): the distance of predicted and true flow f (N,3).
 
-    In length units. DataError on other shapes.
+    In length units. Raises DataError on other shapes.
 
     >>> end_point_errors(np.array([[1.0, 0, 0]]), np.array([[1.0, 3, 4]])).tolist()
     [5.0]
@@ -96,7 +96,7 @@ def flow_update(predicted: np.ndarray, truth: np.ndarray) -> MotionStatistics:
     """Returns the statistics of one frame pair from predicted and true flow f (N,3) in length units.
 
     AccS, AccR and Outlier count points by absolute error at each of TAUS, or by the error relative to the true flow's
-    length. DataError on other shapes.
+    length. Raises DataError on other shapes.
 
     >>> found = motion_compute(flow_update(np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([[1.0, 0, 0], [0, 1, 0]])))
     >>> found.epe3d, found.shares[0.05].accs, found.shares[0.05].accr, found.shares[0.05].outlier
@@ -162,7 +162,7 @@ def part_motion_update(
 
 
 def motion_merge(parts: Iterable[MotionStatistics]) -> MotionStatistics:
-    """Returns the statistics of all parts together, equal to those of all pairs at once. DataError without parts."""
+    """Returns the statistics of all parts together, equal to those of all pairs at once. Raises DataError without parts."""
     parts = list(parts)
     if not parts:
         raise DataError("no statistics to merge: evaluate at least one frame pair")

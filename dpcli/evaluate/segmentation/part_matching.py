@@ -27,7 +27,7 @@ class FrameMatch:
 def hungarian_matching(iou: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the rows and columns i64 (min(G,P)) that pair true and predicted parts one to one for the largest sum.
 
-    iou f64 (G,P): what a pair is worth. The Hungarian method (Kuhn 1955), as scipy has it.
+    iou f64 (G,P): what a pair is worth. The Hungarian method (Kuhn 1955), as in scipy.
 
     >>> rows, columns = hungarian_matching(np.array([[0.6, 0.5], [0.5, 0.0]]))
     >>> columns.tolist()

@@ -26,7 +26,7 @@ class Overlap:
 
     @property
     def union(self) -> np.ndarray:
-        """Points in one or both of true part g and predicted part p, f64 (G,P); never 0."""
+        """Returns the number of points in one or both of true part g and predicted part p, f64 (G,P); never 0."""
         return self.truth_sizes[:, None] + self.sizes - self.shared
 
 

@@ -10,7 +10,7 @@ from dpcli.errors import DataError
 def true_motion(pose: np.ndarray, source: int, target: int) -> np.ndarray:
     """Returns the motion of each part from frame `source` to `target`, f64 (parts,4,4), from part-to-world poses (F,parts,4,4).
 
-    DataError when a pose is not finite or can't be inverted.
+    Raises DataError when a pose is not finite or can't be inverted.
     """
     try:
         motion = pose[target] @ np.linalg.inv(pose[source])

@@ -54,7 +54,7 @@ class Counted:
 
     @property
     def left_out(self) -> list[LeftOut]:
-        """The samples that don't count."""
+        """Returns the samples that don't count."""
         return [LeftOut(reason, names) for reason, names in self.about["left_out"]]
 
 

@@ -55,7 +55,7 @@ class VideoReport:
 
     @property
     def roles(self) -> dict[str, dict[str, float]]:
-        """The means over the views of each role that occurs."""
+        """Returns the means over the views of each role that occurs."""
         return {role: self.mean(role) for role in ROLES if any(view.role == role for view in self.views)}
 
     def mean(self, role: str | None = None) -> dict[str, float]:
@@ -166,7 +166,7 @@ def view_values(report: VideoReport) -> tuple[dict[str, dict[str, float]], dict[
 
 
 def _choose_metrics(asked: Sequence[str] | None, predicted: Source, truth: Source) -> list[str]:
-    """Returns the metrics to compute. DataError for those that these sources can't give."""
+    """Returns the metrics to compute. Raises DataError for those that these sources can't give."""
     scene = isinstance(predicted, SceneSource) and isinstance(truth, ViewsSource)
     fields = truth.reader.fields if scene else ()
     silhouettes = truth.has_alpha and predicted.has_alpha

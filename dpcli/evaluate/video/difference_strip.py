@@ -34,7 +34,7 @@ class DifferenceStrip:
         self.rows.setdefault(title, []).append((frame, np.concatenate([theirs, ours, apart])))
 
     def save(self, path: Path) -> None:
-        """Writes the picture. DataError when there is nothing to show, or it can't be written."""
+        """Writes the picture. Raises DataError when there is nothing to show, or it can't be written."""
         if not self.rows:
             raise DataError(f"--picture {path}: no pictures were compared")
         rows = [

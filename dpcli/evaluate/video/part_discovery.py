@@ -93,7 +93,7 @@ def part_score(
     *,
     seed: int = 0,
 ) -> PartScore:
-    """Scores how well a scene's parts are those of the truth. DataError when no point has a true part."""
+    """Scores how well a scene's parts are those of the truth. Raises DataError when no point has a true part."""
     known = part >= 0
     if not known.any():
         raise DataError("parts: no surface point of the truth has a known part (all are -1)")
@@ -139,7 +139,7 @@ def carry_points(scene: GaussianScene, points: np.ndarray, times: np.ndarray) ->
 def track_score(scene: GaussianScene, track: np.ndarray, times: np.ndarray) -> TrackScore:
     """Measures how far a scene carries true surface points f (T,M,3) from where they are at `times`, seconds (T).
 
-    NaN errors when there is only one frame. DataError without points.
+    NaN errors when there is only one frame. Raises DataError without points.
     """
     frames, points = track.shape[:2]
     if points == 0:

@@ -104,7 +104,7 @@ def picture_update(
 
 
 def picture_merge(parts: Iterable[PictureStatistics]) -> PictureStatistics:
-    """Returns the statistics of several sets of frames, one after the other. ValueError for none."""
+    """Returns the statistics of several sets of frames, one after the other. Raises ValueError for none."""
     rows = [[getattr(part, f.name) for f in fields(PictureStatistics)] for part in parts]
     if not rows:
         raise ValueError("no statistics to merge")

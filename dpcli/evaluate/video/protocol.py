@@ -85,7 +85,7 @@ def video_protocol(
     """Returns a protocol by its name, over another background or with other networks when they are given.
 
     lpips: alex | vgg | squeeze; fvd: a variant of `frechet/variants.py`; every: its windows start each so many
-    frames. UsageError for names there aren't.
+    frames. Raises UsageError for names there aren't.
     """
     if name not in PROTOCOLS:
         raise UsageError(f"--protocol {name}: expected {', '.join(PROTOCOLS)}")

@@ -11,7 +11,7 @@ PSNR_CAP = 100.0  # dB: what equal pictures score, whose PSNR is infinite (commo
 
 
 def planar(picture: np.ndarray) -> np.ndarray:
-    """Returns a picture (H,W) or (H,W,C) of any number type as contiguous f32 (C,H,W). ValueError on another shape."""
+    """Returns a picture (H,W) or (H,W,C) of any number type as contiguous f32 (C,H,W). Raises ValueError on another shape."""
     if picture.ndim not in (2, 3):
         raise ValueError(f"a picture must have shape (H,W) or (H,W,C), but has {picture.shape}")
     picture = picture[..., None] if picture.ndim == 2 else picture

@@ -18,7 +18,7 @@ def ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, b
 
     Mean over windows and channels of pictures (H,W) or (H,W,C). border "valid": windows inside the picture (what
     scikit-image and the authors' code average); "reflect": a window per pixel, the picture mirrored at its edges
-    (torchmetrics). ValueError when the picture is too small; else raises as `check_pair`.
+    (torchmetrics). Raises ValueError when the picture is too small; else raises as `check_pair`.
 
     >>> ramp = np.tile(np.linspace(0, 1, 16, dtype=np.float32), (16, 1))
     >>> ssim(ramp, ramp), round(ssim(ramp, 1 - ramp), 3)
@@ -34,7 +34,7 @@ def ms_ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0
 
     Negative factors count as 0. `border` is that of the last scale's similarity; the contrast-structure factors are
     means over the windows inside the picture (torchmetrics, whose value "reflect" gives, does the same).
-    ValueError for pictures under 176 pixels; else raises as `check_pair`.
+    Raises ValueError for pictures under 176 pixels; else raises as `check_pair`.
     """
     check_pair(predicted, truth, data_range)
     return multi_scale(planar(predicted), planar(truth), data_range, border)
@@ -97,7 +97,7 @@ def gaussian_window() -> np.ndarray:
 def ssim_reference(
     predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, border: str = "valid"
 ) -> float:
-    """Returns `ssim` by its float64 numpy twin, after the paper's formula: same arguments, same result to rounding."""
+    """Returns `ssim` in float64 by numpy, as a reference, by the paper's formula: same arguments, same result to rounding."""
     check_pair(predicted, truth, data_range)
     pictures = [np.moveaxis(np.atleast_3d(p).astype(np.float64), -1, 0) for p in (predicted, truth)]
     whole, _, windows = _similarity_numpy(*pictures, data_range, _padding(pictures[0].shape, border))

@@ -48,7 +48,7 @@ def surface_score(scene: GaussianScene, track: np.ndarray, times: np.ndarray, *,
     """Compares what is visible of a scene with true surface points f (T,M,3) at `times`, seconds (T).
 
     diameter: diagonal of the points' bounding box in the first frame. seed: of the choice among a frame's visible points.
-    DataError without points.
+    Raises DataError without points.
     """
     if track.shape[1] == 0:
         raise DataError("surface: the truth has no surface points")

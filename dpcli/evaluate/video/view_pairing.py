@@ -18,7 +18,7 @@ def match_views(
 ) -> list[tuple[int, int]]:
     """Returns (view of the prediction, view of the truth) of what is compared, in the truth's order.
 
-    The protocol says which views of the truth; the others of either side go to `left_out`. DataError when one lacks a
+    The protocol says which views of the truth; the others of either side go to `left_out`. Raises DataError when one lacks a
     partner and `intersect` is off, or none has.
     """
     compared = [i for i, view in enumerate(truth.views) if protocol.views in ("all", view.role)]

@@ -82,7 +82,7 @@ def fit_clips(
 
 
 def _name_scenes(views: Sequence[str], folder: Path) -> list[tuple[Path, Path]]:
-    """Returns (views, scene) of each clip, in the order of their names. UsageError where that can't be."""
+    """Returns (views, scene) of each clip, in the order of their names. Raises UsageError where that can't be."""
     if "-" in views or str(folder) == "-":
         raise UsageError("-: a pipe holds one clip; name files, and a folder with -o, to fit several")
     if folder.exists() and not folder.is_dir():

@@ -108,7 +108,7 @@ def _make_folder(part: Path, folder: Path) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
+    """Writes readable JSON, equal bytes for equal content, whole or not at all. Raises DataError when it can't be written."""
     write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
 

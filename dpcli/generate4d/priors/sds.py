@@ -70,7 +70,7 @@ def sds_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
 
 
 class ScoreDistillation:
-    """A `Prior` by score distillation sampling. The model is frozen; its conditioning is computed once for each frame.
+    """Implements `Prior` by score distillation sampling. The model is frozen; its conditioning is computed once for each frame.
 
     guidance_scale: classifier-free guidance. timestep: "annealed" by progress, or "random", uniform in t_range, one per
     view. t_range: shares of the model's steps; may be set anew between stages (SC4D: 0.6-0.8, then 0.2-0.8).

@@ -44,12 +44,12 @@ class Zero123Model:
 
     @property
     def device(self) -> torch.device:
-        """The device of all networks."""
+        """Returns the device of all networks."""
         return self.camera_projection.weight.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """The precision of all networks."""
+        """Returns the precision of all networks."""
         return self.camera_projection.weight.dtype
 
 

@@ -48,7 +48,7 @@ def encode(
 
 
 class Perceptron(nn.Module):
-    """ReLU layers of Xavier start; deep ones get their input again half-way (the usual NeRF shape)."""
+    """Stacks ReLU layers with Xavier initialization; deep stacks get their input again half-way (the usual NeRF shape)."""
 
     def __init__(self, inputs: int, width: int, depth: int) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ def _head(width: int, outputs: int, bias: float = 0.0) -> nn.Linear:
 
 
 class MotionField(nn.Module):
-    """The four networks: deformation (d, rotation), partition (m), rigid motion (R, t) and fusion (w).
+    """Holds the four networks: deformation (d, rotation), partition (m), rigid motion (R, t) and fusion (w).
 
     parts: S. Without `rigid` only the deformation is left (row a of Table 5.2); with it, `fusion` says whether both
     motions are blended by w (`blend_motions`) or added (`add_motions`). A part turns about its center, so that turning

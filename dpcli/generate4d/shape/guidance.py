@@ -25,7 +25,7 @@ class ShapeGuidance:
 
     @property
     def confidence(self) -> float:
-        """The median of the frames' confidence, 0..1."""
+        """Returns the median of the frames' confidence, 0..1."""
         return float(np.median([frame.confidence for frame in self.layers]))
 
     def pictures(self, frames: list[int], poses: Tensor, intrinsics: Tensor, size: int) -> Tensor:  # [B, S, S, 4]

@@ -38,7 +38,7 @@ class Camera:
 
     @property
     def distance(self) -> float:
-        """The depth of the world's origin, about which the object is centered."""
+        """Returns the depth of the world's origin, about which the object is centered."""
         return float(self.world_to_camera[2, 3])
 
 

@@ -112,7 +112,7 @@ def _shares(centers: Tensor, values: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """Two convolutions of 3 x 3 with batch normalization, which costs nothing once trained; the second adds to the first."""
+    """Applies two 3 x 3 convolutions with batch normalization, which is free once trained; the second adds to the first."""
 
     def __init__(self, first: int, last: int) -> None:
         super().__init__()

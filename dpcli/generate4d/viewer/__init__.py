@@ -57,7 +57,7 @@ def write_page(
 
 
 def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest corner and extent (3) of all means of all frames; an extent is never 0."""
+    """Returns the lowest corner and the extent (3) of all means of all frames; an extent is never 0."""
     low, high = scene.frame_mean.min((0, 1)).astype(np.float64), scene.frame_mean.max((0, 1)).astype(np.float64)
     return low, np.maximum(high - low, 1e-9)
 
@@ -83,12 +83,12 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
 
 
 def _differences(values: np.ndarray) -> np.ndarray:
-    """Each frame minus the one before, modulo the type; the first as it is. Contiguous."""
+    """Returns each frame minus the one before, modulo the type; the first as it is. The result is contiguous."""
     return np.concatenate([values[:1], values[1:] - values[:-1]])
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(T,N,4) with signs such that no Gaussian jumps from q to -q between frames."""
+    """Returns quaternions (T,N,4) with signs such that no Gaussian jumps from q to -q between frames."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
     return quaternions * np.concatenate([np.ones_like(flips[:1]), np.cumprod(flips, 0)])
 
@@ -96,7 +96,7 @@ def _continuous(quaternions: np.ndarray) -> np.ndarray:
 def describe(
     scene: GaussianScene, arrays: dict[str, np.ndarray], *, title: str, history: Sequence[dict], fps: float
 ) -> dict[str, Any]:
-    """The page's header: counts, where each array begins, camera, parts, provenance."""
+    """Returns the page's header: counts, where each array begins, camera, parts, provenance."""
     low, extent = _box(scene)
     lens, pose = scene.camera_intrinsics[scene.reference], scene.camera_world_to_camera[scene.reference]
     azimuth, elevation, radius = orbit_of(pose)

@@ -17,19 +17,22 @@ TASKS = 8
 
 
 def ranges(count: int, parts: int) -> list[tuple[int, int]]:
-    """0..count cut into at most `parts` ranges that differ by one at most."""
+    """Cuts 0..count into at most `parts` ranges (low, high) whose lengths differ by one at most."""
     parts = max(1, min(parts, count))
     bounds = [count * part // parts for part in range(parts + 1)]
     return list(zip(bounds, bounds[1:]))
 
 
 def steps(low: int, high: int, step: int) -> list[tuple[int, int]]:
-    """low..high cut into pieces of `step`, the last of what is left."""
+    """Cuts low..high into ranges (low, high) of length `step`; the last may be shorter."""
     return [(start, min(start + step, high)) for start in range(low, high, step)]
 
 
 def share_tasks(tasks: Sequence[Task], make_room: Callable[[], Room], work: Callable[[int, Task, Room], None]) -> None:
-    """Call work(number, task, room) for every task; `room` is what `make_room` gave the thread that does it.
+    """Calls work(number, task, room) for every task; `room` is the workspace that `make_room` gave the thread that does it.
+
+    There are as many threads as torch has, and the matrix products of each run on one thread: threads that shared each product
+    would wait for each other several times a task, and longer than they work. No gradients are recorded.
 
     As many threads as torch has, whose matrix products run on themselves alone: threads that shared each product would
     wait for each other several times a piece, and longer than they work. No gradients are recorded.

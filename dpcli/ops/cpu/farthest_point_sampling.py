@@ -21,7 +21,7 @@ _DIGIT = 11  # bits sorted per radix pass: 2,048 counters stay in the nearest ca
 
 @kernel
 def _spread_bits(v):
-    """Put two zero bits between the ten low bits of `v`."""
+    """Puts two zero bits between the ten low bits of `v`."""
     v = (v | (v << 16)) & 0x030000FF
     v = (v | (v << 8)) & 0x0300F00F
     v = (v | (v << 4)) & 0x030C30C3
@@ -30,7 +30,7 @@ def _spread_bits(v):
 
 @kernel
 def _morton_keys(points, n, bits):
-    """Morton keys i32 (n) with `bits` bits per axis."""
+    """Computes Morton keys i32 (n) with `bits` bits per axis."""
     lx, ly, lz = points[0, 0], points[0, 1], points[0, 2]
     mx, my, mz = lx, ly, lz
     for i in range(n):
@@ -52,7 +52,7 @@ def _morton_keys(points, n, bits):
 
 @kernel
 def _morton_order(points, n):
-    """Indices of the first `n` points along the Morton curve: a stable radix sort of their keys."""
+    """Returns the indices of the first `n` points along the Morton curve, by a stable radix sort of their keys."""
     bits = 7 if n <= _SMALL else 10
     keys = _morton_keys(points, n, bits)
     order = np.arange(n).astype(np.int32)
@@ -75,7 +75,7 @@ def _morton_order(points, n):
 
 @kernel
 def _fill_buckets(points, n, order, xyz, box):
-    """Bucket points[:n] into order (n,), xyz (3, buckets*BUCKET) and box (6, buckets); see `bucket_kernel`."""
+    """Sorts points[:n] into buckets: order (n,), xyz (3, buckets*BUCKET) and box (6, buckets); see `bucket_kernel`."""
     order[:n] = _morton_order(points, n)
     for b in range((n + BUCKET - 1) // BUCKET):
         first = b * BUCKET
@@ -91,7 +91,7 @@ def _fill_buckets(points, n, order, xyz, box):
 
 @kernel
 def bucket_kernel(points, lengths, order, xyz, box, first, last):
-    """Bucket clouds first..last-1 of points (B,N,3) f32, the first lengths[b] points of each.
+    """Sorts clouds first..last-1 of points (B,N,3) f32, the first lengths[b] points of each, into buckets.
 
     Bucket j holds the points order[b, j*BUCKET:(j+1)*BUCKET]; order is (B,N) i32, xyz (B,3,buckets*BUCKET) their
     coordinates, box (B,6,buckets) the rows x min, x max, y min, y max, z min, z max.
@@ -111,7 +111,7 @@ def _box_distance(box, b, cx, cy, cz):
 
 @kernel
 def _group_boxes(box, buckets, out):
-    """Bounding boxes of the groups, out (6, groups), of the boxes of `buckets` buckets."""
+    """Computes the bounding boxes of the groups, out (6, groups), from the boxes of `buckets` buckets."""
     for group in range(out.shape[1]):
         first = group * GROUP
         out[:, group] = box[:, first]
@@ -123,7 +123,7 @@ def _group_boxes(box, buckets, out):
 
 @kernel
 def _interleaved(xyz, n):
-    """Each bucket's x, y, z and distances side by side: at constant steps the compiler knows they don't overlap."""
+    """Lays each bucket's x, y, z and distances side by side: at constant steps the compiler knows they don't overlap."""
     data = np.empty(4 * xyz.shape[1], np.float32)
     for i in range(xyz.shape[1]):
         at = i // BUCKET * 4 * BUCKET + i % BUCKET
@@ -135,7 +135,7 @@ def _interleaved(xyz, n):
 
 @inlined
 def _update_bucket(data, bucket, cx, cy, cz):
-    """Lower the distances of one bucket; returns its new maximum."""
+    """Lowers the distances of one bucket and returns its new maximum."""
     x = np.uintp(4 * BUCKET * bucket)  # unsigned: numba then drops the negative-index case and the loop vectorizes
     y, z, best = x + np.uintp(BUCKET), x + np.uintp(2 * BUCKET), x + np.uintp(3 * BUCKET)
     for i in range(np.uintp(BUCKET)):
@@ -151,7 +151,7 @@ def _update_bucket(data, bucket, cx, cy, cz):
 
 @inlined
 def _update_group(data, box, top, group, cx, cy, cz, lower):
-    """Update a group's buckets that are nearer than their largest distance `top`; returns the group's largest."""
+    """Updates a group's buckets that are nearer than their largest distance `top` and returns the group's largest."""
     first = np.uintp(group * GROUP)
     for i in range(np.uintp(GROUP)):
         lower[i] = _box_distance(box, first + i, cx, cy, cz)
@@ -165,7 +165,7 @@ def _update_group(data, box, top, group, cx, cy, cz, lower):
 
 @inlined
 def _farthest(data, top, group_top, order, n):
-    """Lowest original index among the points at the largest distance, and that distance."""
+    """Returns the lowest original index among the points at the largest distance, and that distance."""
     most = np.float32(0)
     for group in range(group_top.size):
         most = max(most, group_top[group])
@@ -214,7 +214,7 @@ def _sample(points, n, start, out):
 
 @kernel
 def fps_kernel(points, lengths, start, out, first, last):
-    """Farthest points of clouds first..last-1 into out (B,S) i64: of points (B,N,3) f32, the first lengths[b] of each.
+    """Writes farthest points of clouds first..last-1, of points (B,N,3) f32 the first lengths[b] of each, into out (B,S) i64.
 
     The first sample is `start`, ties go to the lowest index, and samples beyond lengths[b] repeat the sequence.
     """

@@ -9,7 +9,7 @@ from dpcli.ops.cpu.jit import arithmetic_kernel
 
 @arithmetic_kernel
 def _insert(value, what, near, index, count):
-    """Keep (value, what) in ascending `near` and its `index`, which hold `count`, behind equal values; the new count.
+    """Inserts (value, what) into ascending `near` and `index`, which hold `count`, behind equal values; returns the new count.
 
     Where they are full the last one leaves; the caller has seen that it is larger.
     """
@@ -23,7 +23,7 @@ def _insert(value, what, near, index, count):
 
 @arithmetic_kernel
 def nearest_kernel(distance, shares, starts, out, first, last):
-    """The nearest points of rows first..last-1 among several frames.
+    """Finds the nearest points of rows first..last-1 among several frames.
 
     distance (O,T,P,P) f32, from point p of frame t to those of the frame at the o-th offset; shares (T,O) i64, the most
     that are taken from it; starts (T,O) i64, the index of its first point. out (T*P,k) i64: of those taken the k nearest,
@@ -59,7 +59,7 @@ def nearest_kernel(distance, shares, starts, out, first, last):
 
 @arithmetic_kernel
 def pool_kernel(values, idx, largest, total, first, last):
-    """largest and total (B*M,C): maximum and sum over k of values[b, idx[b,m,k]], values (B,N,C), for rows first..last-1."""
+    """Computes maximum and sum over k of values[b, idx[b,m,k]] (B,N,C) into largest and total (B*M,C), rows first..last-1."""
     count, neighbors, channels = idx.shape[1], idx.shape[2], np.uintp(values.shape[2])
     for row in range(first, last):
         b, m = row // count, row % count
@@ -77,7 +77,7 @@ def pool_kernel(values, idx, largest, total, first, last):
 
 @arithmetic_kernel
 def pool_back_kernel(values, idx, largest, to_largest, to_total, out, first, last):
-    """The gradient of `pool_kernel` for clouds first..last-1, added to out (B,N,C); equal maxima share theirs."""
+    """Adds the gradient of `pool_kernel` for clouds first..last-1 to out (B,N,C); equal maxima share theirs."""
     neighbors, channels = idx.shape[2], np.uintp(values.shape[2])
     ties, share = np.empty(values.shape[2], values.dtype), np.empty(values.shape[2], values.dtype)
     for b in range(first, last):

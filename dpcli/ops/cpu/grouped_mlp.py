@@ -66,7 +66,10 @@ def moments_table(table, offset, idx, sums, squares):
 
 @piece_kernel
 def hidden_xyz(points, centers, idx, weight, bias, first, out):
-    """out[r] = max(weight @ (points[idx[r]] - centers[i]) + bias, 0) of a piece. weight (3,C), bias (C), out (rows,C)."""
+    """Computes out[r] = max(weight @ (points[idx[r]] - centers[i]) + bias, 0) for a block of rows.
+
+    weight (3,C), bias (C), out (rows,C); `first`: the block's first centroid.
+    """
     count, neighbors = idx.shape[1], idx.shape[2]
     for piece in range(out.shape[0] // neighbors):
         i = first + piece
@@ -83,7 +86,7 @@ def hidden_xyz(points, centers, idx, weight, bias, first, out):
 
 @piece_kernel
 def hidden_table(table, offset, idx, first, out):
-    """out[r] = max(table[idx[r]] - offset[i], 0) of a piece. table (B,N,C), offset (B,M,C), out (rows,C)."""
+    """Computes out[r] = max(table[idx[r]] - offset[i], 0) for a block of rows. table (B,N,C), offset (B,M,C), out (rows,C)."""
     count, neighbors = idx.shape[1], idx.shape[2]
     for piece in range(out.shape[0] // neighbors):
         i = first + piece
@@ -96,7 +99,7 @@ def hidden_table(table, offset, idx, first, out):
 
 @piece_kernel
 def activate_largest(rows, bias, neighbors, best):
-    """rows (R*C): products in, max(products + bias, 0) out; best (M*C): each centroid's largest. bias (C), C in eights."""
+    """Sets rows (R*C) of products to max(products + bias, 0), best (M*C) to each centroid's largest. bias (C), C in eights."""
     channels = bias.size
     zero = lanes(np.float32(0))
     for i in range(rows.size // channels // neighbors):
@@ -111,7 +114,7 @@ def activate_largest(rows, bias, neighbors, best):
 
 @piece_kernel
 def largest(rows, neighbors, first, best, where):
-    """Per centroid and channel of a piece the largest value over its rows, and which row; ties: the first.
+    """Finds, per centroid and channel of a block, the largest value over its rows, and which row; ties: the first.
 
     rows (rows*C), best (M,C) and where (M,C) i32 for all centroids, at least WIDTH channels. Four vectors of running maxima
     stay in registers while the rows go by; where fewer channels are left, vectors overlap.
@@ -151,7 +154,7 @@ def largest(rows, neighbors, first, best, where):
 
 @parallel_kernel
 def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
-    """The gradient at a ReLU's pooled output `out`, sorted by the rows it goes to, and its sums.
+    """Sorts the gradient at a ReLU's pooled output `out` by the rows it goes to, and sums it.
 
     grad, out, best (M,C), where (M,C) i32 in 0..K-1, mean (C). g is grad where out > 0. Centroid i's channels with
     out > 0 that reach row k, ascending, are order[i, starts[i,k] : starts[i,k+1]], i32, and values (M,C) f32 their g;
@@ -184,7 +187,7 @@ def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
 
 @inlined
 def _through_relu(hidden, dense, at0, at1, add0, add1, order, values, first, last, base, weight, grad_weight, zero):
-    """Gradient of two runs of WIDTH channels of one row, at `at0` and `at1`, through the ReLU; adds to grad_weight.
+    """Takes the gradient of two runs of WIDTH channels of one row, at `at0` and `at1`, through the ReLU; adds to grad_weight.
 
     first..last: the outputs whose maximum this row is, in `order`, with their gradients in `values`.
     """
@@ -202,7 +205,7 @@ def _through_relu(hidden, dense, at0, at1, add0, add1, order, values, first, las
 
 @piece_kernel
 def back_xyz(hidden, dense, constant, order, values, starts, weight, grad_weight, points, centers, idx, first, sums):
-    """Back through a piece's pooling, second linear layer and the ReLU of `hidden_xyz`.
+    """Computes the gradient through the pooling, the second linear layer and the ReLU of `hidden_xyz`, for a block of rows.
 
     With g[r] = dense[r] + constant + sum over the row's pooled values of value * weight[o], where hidden[r] > 0, else 0,
     and x as in `moments_xyz`: sums (4,C1) f64 += sums over rows of g, g x, g y, g z, and grad_weight[o] += value * hidden[r].
@@ -267,7 +270,7 @@ def back_xyz(hidden, dense, constant, order, values, starts, weight, grad_weight
 def back_table(
     hidden, dense, constant, order, values, starts, weight, grad_weight, idx, first, to_table, to_offset, nodes
 ):
-    """Does as `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
+    """Computes as `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
 
     to_table (blocks*B*N*2*WIDTH), in blocks of channels (rows of all channels would fall on few sets of the cache),
     to_offset (B*M*C1), nodes = N.
@@ -315,7 +318,7 @@ def back_table(
 
 @parallel_kernel
 def reach(idx, centers, out):
-    """out (B,N,4) f64: how many rows have neighbor j, and the sum of their centroids. idx (B,M,K) i64, centers (B,M,3)."""
+    """Counts into out (B,N,4) f64 the rows that have neighbor j, and sums their centroids. idx (B,M,K) i64, centers (B,M,3)."""
     batch, count, neighbors = idx.shape
     for b in prange(batch):
         for m in range(count):
@@ -328,7 +331,7 @@ def reach(idx, centers, out):
 
 @parallel_kernel
 def products(first, second, shift, sums):
-    """sums (blocks,C) f64 += sums over rows of first * (second - shift). first and second (R,C), shift (C)."""
+    """Adds sums over rows of first * (second - shift) to sums (blocks,C) f64. first and second (R,C), shift (C)."""
     rows, channels = first.shape
     blocks = sums.shape[0]
     for block in prange(blocks):
@@ -344,7 +347,7 @@ def products(first, second, shift, sums):
 
 @parallel_kernel
 def back_norm(grad, table, reach, weight, mean, scale, t0, t1):
-    """Through batch norm, in place: the gradient at the table from the sums of the gradient behind it, grad (B,N,C).
+    """Computes in place, through batch norm, the gradient at the table from the sums of the gradient behind it, grad (B,N,C).
 
     A row of neighbor j and centroid i adds scale * (g - t0 - (table[j] - offset[i] - mean) * t1); the sums of offsets,
     weight @ centroid, come from `reach`. table (B,N,C), weight (3,C), mean, scale, t0, t1 (C).

@@ -7,7 +7,7 @@ from dpcli.ops.cpu.jit import arithmetic_kernel
 
 @arithmetic_kernel
 def group_forward(features, index, weight, out, first, last):
-    """features (N,F), index (P,n), weight (P,n,D) -> out (P,D,F), for centers first..last."""
+    """Computes out (P,D,F) of features (N,F), index (P,n) and weight (P,n,D), for centers first..last."""
     for p in range(first, last):
         out[p] = 0
         for j in range(index.shape[1]):
@@ -22,7 +22,7 @@ def group_forward(features, index, weight, out, first, last):
 
 @arithmetic_kernel
 def group_backward(grad, index, weight, out, first, last):
-    """The transpose: grad (P,D,F) added into out (N,F), for columns first..last, so that threads never share an element."""
+    """Adds the transpose of `group_forward`, of grad (P,D,F), to out (N,F), in columns first..last; threads share none."""
     for p in range(index.shape[0]):
         for j in range(index.shape[1]):
             target = out[index[p, j], first:last]

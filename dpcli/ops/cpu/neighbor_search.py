@@ -28,7 +28,7 @@ def _is_sorted(times):
 
 @kernel
 def _lower_bound(times, value):
-    """First position whose time is at least `value`, in sorted times."""
+    """Returns the first position whose time is at least `value`, in sorted times."""
     low, high = 0, times.size
     while low < high:
         middle = (low + high) >> 1
@@ -41,7 +41,7 @@ def _lower_bound(times, value):
 
 @kernel
 def _measure(x, y, z, first, size, cx, cy, cz, out):
-    """Squared distances of `size` points from `first` on into `out`; returns the least."""
+    """Writes the squared distances of `size` points from `first` on into `out` and returns the least."""
     base = np.uintp(first)  # unsigned: numba then drops the negative-index case and the loop vectorizes
     for i in range(np.uintp(size)):
         dx = cx - x[base + i]
@@ -56,7 +56,7 @@ def _measure(x, y, z, first, size, cx, cy, cz, out):
 
 @kernel
 def _sift_down(heap, at):
-    """Restore the max-heap below position `at`."""
+    """Restores the max-heap below position `at`."""
     key = heap[at]
     child = 2 * at + 1
     while child < heap.size:
@@ -72,7 +72,7 @@ def _sift_down(heap, at):
 
 @kernel
 def _keep(heap, filled, key):
-    """Keep the heap.size smallest keys seen; a heap only once full. Returns how many are kept."""
+    """Keeps the heap.size smallest keys seen; a heap only once full. Returns how many are kept."""
     if filled == heap.size:
         heap[0] = key
         _sift_down(heap, 0)
@@ -86,14 +86,14 @@ def _keep(heap, filled, key):
 
 @kernel
 def _worst(heap, filled, block, bits):
-    """Largest kept distance once the heap is full, else infinity. The block's spare slot turns bits into a float."""
+    """Returns the largest kept distance of a full heap, else infinity. The block's spare slot turns bits into a float."""
     bits[_BLOCK] = heap[0] >> 32 if filled == heap.size else _INFINITE
     return block[_BLOCK]
 
 
 @kernel
 def _first_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, block, row):
-    """Write the first hits among points low..high-1, ascending, until the row is full; returns how many."""
+    """Writes the first hits among points low..high-1, ascending, until the row is full; returns how many."""
     filled = 0
     for first in range(low, high, _BLOCK):
         size = min(_BLOCK, high - first)
@@ -112,7 +112,7 @@ def _first_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, block,
 
 @kernel
 def _nearest_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, block, bits, heap):
-    """Collect the nearest hits among points low..high-1 that lie within `widest`; returns how many."""
+    """Collects the nearest hits among points low..high-1 that lie within `widest`; returns how many."""
     filled = 0
     worst = widest
     for first in range(low, high, _BLOCK):
@@ -132,7 +132,7 @@ def _nearest_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, bloc
 
 @kernel
 def _nearest_row(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, guess, block, bits, heap, row):
-    """One row of nearest hits; returns how many, and a radius likely to hold k for the next centroid.
+    """Finds one row of nearest hits; returns how many, and a radius likely to hold k for the next centroid.
 
     Looks first within `guess`, the last centroid's suggestion: a full row proves that far enough, else all is searched.
     """
@@ -149,7 +149,7 @@ def _nearest_row(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, guess
 
 @kernel
 def _query_clip(xyz, times, centroids, centroid_times, limits, nearest, low_row, high_row, index, count):
-    """Rows low_row..high_row-1 of one clip; where its times are sorted, only the frames within reach are looked at."""
+    """Fills rows low_row..high_row-1 of one clip; where its times are sorted, only the frames within reach are looked at."""
     x, y, z = xyz[0], xyz[1], xyz[2]  # views made once: each costs an atomic reference count
     block = np.empty(_BLOCK + 1, np.float32)
     bits = block.view(np.int32)
@@ -177,7 +177,7 @@ def _query_clip(xyz, times, centroids, centroid_times, limits, nearest, low_row,
 
 @kernel
 def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, index, count, first, last):
-    """Fill rows first..last-1, counted through all clips, of index (B,M,k) i64 and count (B,M) i64.
+    """Fills rows first..last-1, counted through all clips, of index (B,M,k) i64 and count (B,M) i64.
 
     xyz (B,3,N) f32, times (B,N) i64, centroids (B,M,3) f32, centroid_times (B,M) i64, limits (R,) f32 squared radii;
     see `ball_query.space_time_ball_query`.
@@ -192,7 +192,7 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, in
 
 @kernel
 def _frame_hits(x, y, z, low, high, cx, cy, cz, limit, block, row):
-    """Does as `_first_hits` among points low..high-1 of one frame, whose limit is the same for all."""
+    """Finds hits as `_first_hits` does, among points low..high-1 of one frame, whose limit is the same for all."""
     filled = 0
     for first in range(low, high, _BLOCK):
         size = min(_BLOCK, high - first)
@@ -208,7 +208,7 @@ def _frame_hits(x, y, z, low, high, cx, cy, cz, limit, block, row):
 
 @kernel
 def _balanced_row(x, y, z, times, centroid, t, limits, shares, block, row):
-    """Fill one row by frames, from the earliest; returns the number of hits."""
+    """Fills one row by frames, from the earliest; returns the number of hits."""
     reach = limits.size - 1
     own = row[shares[:reach].sum() :][: shares[reach]]
     total = _frame_share(x, y, z, times, centroid, t, limits[0], block, own)
@@ -228,7 +228,7 @@ def _balanced_row(x, y, z, times, centroid, t, limits, shares, block, row):
 
 @kernel
 def _frame_share(x, y, z, times, centroid, t, limit, block, part):
-    """The first hits of frame t, the first repeated in unused slots, -1 in all if there is none; returns how many."""
+    """Finds the first hits of frame t, the first repeated in unused slots, -1 in all if there is none; returns how many."""
     low, high = _lower_bound(times, t), _lower_bound(times, t + 1)
     filled = _frame_hits(x, y, z, low, high, centroid[0], centroid[1], centroid[2], limit, block, part)
     part[filled:] = part[0] if filled else -1
@@ -256,7 +256,7 @@ def _balanced_clip(points, times, centroids, centroid_times, limits, shares, low
 
 @kernel
 def balanced_query_kernel(points, times, centroids, centroid_times, limits, shares, index, count, first, last):
-    """Does as `ball_query_kernel`, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
+    """Fills rows as `ball_query_kernel` does, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
     rows = centroids.shape[1]
     while first < last:
         b = first // rows
@@ -269,7 +269,7 @@ def balanced_query_kernel(points, times, centroids, centroid_times, limits, shar
 
 @kernel
 def _box_bounds(box, cx, cy, cz, lower, upper):
-    """Squared distances to the near and the far side of every box; returns the box with the closest far side.
+    """Computes squared distances to the near and the far side of every box; returns the box with the closest far side.
 
     The near side is never further than a point inside: rounding is monotone, the order of operations the same.
     """
@@ -309,7 +309,7 @@ def _scan_bucket(x, y, z, order, first, size, cx, cy, cz, block, bits, heap, fil
 
 @kernel
 def _search(x, y, z, order, n, box, bucket, cx, cy, cz, lower, upper, block, bits, heap):
-    """Keep the nearest of all n bucketed points: first some close buckets, then all that may hold a nearer point."""
+    """Keeps the nearest of all n bucketed points: first some close buckets, then all that may hold a nearer point."""
     start = _box_bounds(box, cx, cy, cz, lower, upper)
     reach = (heap.size - 1) // (2 * bucket)  # neighbors on the curve, enough for k points, are close in space
     filled = 0
@@ -328,7 +328,7 @@ def _search(x, y, z, order, n, box, bucket, cx, cy, cz, lower, upper, block, bit
 
 @kernel
 def _knn_cloud(order, n, xyz, box, bucket, queries, low, high, squared, index):
-    """Rows low..high-1 of one cloud."""
+    """Fills rows low..high-1 of one cloud."""
     x, y, z = xyz[0], xyz[1], xyz[2]
     block = np.empty(_BLOCK + 1, np.float32)
     bits = block.view(np.int32)
@@ -348,7 +348,7 @@ def _knn_cloud(order, n, xyz, box, bucket, queries, low, high, squared, index):
 
 @kernel
 def knn_kernel(order, lengths, xyz, box, bucket, queries, squared, index, first, last):
-    """Fill rows first..last-1, counted through all clouds, of squared (B,M,k) f32 and index (B,M,k) i64.
+    """Fills rows first..last-1, counted through all clouds, of squared (B,M,k) f32 and index (B,M,k) i64.
 
     order, lengths, xyz, box: of `kernels_fps.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
     `nearest.knn`.

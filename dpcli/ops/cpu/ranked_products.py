@@ -9,7 +9,7 @@ from dpcli.ops.cpu.jit import piece_kernel
 
 @piece_kernel
 def modulate_kernel(gathered, taylor, k, out, first, last):
-    """out[r] (T,C) = taylor[r,k] times gathered[r,k], from gathered (R,K,C) and taylor (R,K,T), for rows first..last-1."""
+    """Sets out[r] (T,C) = taylor[r,k] times gathered[r,k], from gathered (R,K,C) and taylor (R,K,T), for rows first..last-1."""
     channels = np.uintp(gathered.shape[2])
     for r in range(first, last):
         line = gathered[r, k]
@@ -21,7 +21,7 @@ def modulate_kernel(gathered, taylor, k, out, first, last):
 
 @piece_kernel
 def modulate_back_kernel(grad, gathered, taylor, k, to_gathered, to_taylor, first, last):
-    """The gradient of `modulate_kernel`: from grad (R,T,C), to_gathered[r,k] and to_taylor[r,k] are set."""
+    """Sets to_gathered[r,k] and to_taylor[r,k] to the gradient of `modulate_kernel`, from grad (R,T,C)."""
     channels = np.uintp(gathered.shape[2])
     for r in range(first, last):
         line, target = gathered[r, k], to_gathered[r, k]

@@ -15,7 +15,7 @@ _SWEEPS = 12  # of Jacobi rotations at most; six are the rule
 
 @arithmetic_kernel
 def _turn_columns(m, v, p, q):
-    """Make columns p and q of m (3,3) orthogonal, the longer one first, by a rotation that v (3,3) takes part in.
+    """Makes columns p and q of m (3,3) orthogonal, the longer one first, by a rotation that v (3,3) takes part in.
 
     Returns whether there was anything to do.
     """
@@ -36,7 +36,7 @@ def _turn_columns(m, v, p, q):
 
 @arithmetic_kernel
 def _unit_columns(m):
-    """Columns 0 and 1 of m (3,3) to length 1 and orthogonal, and column 2 their cross product; False if one is zero."""
+    """Makes columns 0 and 1 of m (3,3) orthonormal, and column 2 their cross product; returns False if one is zero."""
     for k in range(2):
         if k == 1:
             dot = m[0, 0] * m[0, 1] + m[1, 0] * m[1, 1] + m[2, 0] * m[2, 1]
@@ -55,7 +55,8 @@ def _unit_columns(m):
 
 @arithmetic_kernel
 def _nearest_rotation(m, v, out):
-    """out (3,3) = the rotation nearest to m (3,3), which is overwritten; scratch v (3,3). One-sided Jacobi (Hestenes 1958).
+    """Writes to out (3,3) the rotation nearest to m (3,3), which is overwritten, by one-sided Jacobi (Hestenes 1958); v (3,3):
+    scratch.
 
     A matrix of rank one or less, which leaves a turn open, leaves out as it is.
 
@@ -79,7 +80,7 @@ def _nearest_rotation(m, v, out):
 
 @arithmetic_kernel
 def kabsch_kernel(source, target, weights, rotation, translation, first, last):
-    """`weighted_kabsch` of source, target (B,N,3), weights (B,N,S) for slots first..last of the B * S; sums in float64."""
+    """Computes `weighted_kabsch` of source, target (B,N,3), weights (B,N,S) for slots first..last of B * S; sums in float64."""
     count, slots = source.shape[1], weights.shape[2]
     m, v = np.empty((3, 3)), np.empty((3, 3))
     for row in range(first, last):
@@ -126,7 +127,7 @@ def kabsch_kernel(source, target, weights, rotation, translation, first, last):
 
 @arithmetic_kernel
 def flow_kernel(points, mask, rotation, translation, out, first, last):
-    """`rigid_flow` of points (B,N,3), mask (B,N,S) for points first..last of the B * N."""
+    """Computes `rigid_flow` of points (B,N,3), mask (B,N,S) for points first..last of the B * N."""
     count, slots = points.shape[1], mask.shape[2]
     for row in range(first, last):
         b, n = row // count, row % count

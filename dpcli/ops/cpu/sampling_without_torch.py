@@ -9,7 +9,7 @@ import numpy as np
 
 
 def fps_numpy(points: np.ndarray, num_samples: int, *, start: int = 0) -> np.ndarray:
-    """Farthest point sampling of one cloud: indices (S,) i64 into points (N,3) f32, as `dpcli.ops.fps` would give them.
+    """Samples farthest points of one cloud: indices (S,) i64 into points (N,3) f32, as `dpcli.ops.fps` would give them.
 
     One thread; ties to the lowest index; num_samples beyond N repeats the sequence from its beginning.
     DPC_BACKEND=torch, or numba missing, selects the plain numpy loop. Raises ValueError on a wrong shape, an empty
@@ -43,7 +43,7 @@ def _kernel():  # a numba dispatcher or None
 
 
 def _fps_plain(points: np.ndarray, num_samples: int, start: int) -> np.ndarray:
-    """The same by one numpy pass over all points per sample."""
+    """Samples farthest points as `fps_numpy` does, by one numpy pass over all points per sample."""
     x, y, z = np.ascontiguousarray(points.T)
     nearest = np.full(len(points), np.inf, np.float32)
     index = [start]

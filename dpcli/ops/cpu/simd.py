@@ -168,7 +168,7 @@ def reciprocal(typingctx, value):
 
 
 def _polynomial(builder: ir.IRBuilder, x: ir.Value, coefficients: tuple[float, ...]) -> ir.Value:
-    """Estrin's scheme: pairs first, so that half the multiplications don't wait for each other."""
+    """Evaluates a polynomial by Estrin's scheme: pairs first, so that half the multiplications don't wait for each other."""
     terms = [_constant(c) for c in coefficients]
     while len(terms) > 1:
         low, high = terms[::2], terms[1::2]
@@ -180,7 +180,7 @@ def _polynomial(builder: ir.IRBuilder, x: ir.Value, coefficients: tuple[float, .
 
 @intrinsic
 def power_of_two(typingctx, value):
-    """2^v for v in -126..127; what lies below counts as -126. 2^v = 2^n 2^f, n the nearest integer."""
+    """Returns 2^v for v in -126..127; what lies below counts as -126. 2^v = 2^n 2^f, n the nearest integer."""
 
     def codegen(context, builder, signature, args):
         v = _higher(builder, args[0], _constant(-126.0))

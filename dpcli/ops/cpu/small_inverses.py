@@ -15,7 +15,7 @@ _SIGNED, _NONE = 0, 2  # positions in ops.small_inverses.GUARDS
 
 @arithmetic_kernel
 def _guard_row(det, moved, min_det, guard):
-    """Move small determinants (W,) away from zero and note which; then invert them in place."""
+    """Moves small determinants (W,) away from zero, notes which, and then inverts them in place."""
     for w in range(det.size):
         if guard != _NONE and abs(det[w]) < min_det:
             moved[w] = True
@@ -83,7 +83,7 @@ def _closed4(m, out, at, det):
 
 @arithmetic_kernel
 def _closed(m, out, at, n, det, moved, min_det, guard):
-    """Closed-form inverses of the diagonal n x n blocks, n <= 4, that start at row and column `at`."""
+    """Inverts the diagonal n x n blocks, n <= 4, that start at row and column `at`, in closed form."""
     if n == 1:
         _closed1(m, out, at, det)
     elif n == 2:
@@ -101,7 +101,7 @@ def _closed(m, out, at, n, det, moved, min_det, guard):
 
 @arithmetic_kernel
 def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
-    """Add sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
+    """Adds sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
 
     Offsets, not slices: a sliced tile has an unknown stride, and its loops no longer vectorize.
     """
@@ -116,7 +116,7 @@ def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
 
 @arithmetic_kernel
 def _invert(m, out, left, right, det, moved, min_det, guard):
-    """Inverses of a tile (n,n,W), n <= 8, which is overwritten; left (q,p,W) and right (p,q,W) are scratch.
+    """Inverts a tile (n,n,W), n <= 8, which is overwritten; left (q,p,W) and right (p,q,W) are scratch.
 
     The leading p x p block A in closed form; where q = n - p rows are left, the others by its Schur complement. det (2,W):
     one over the two blocks' guarded determinants.
@@ -144,7 +144,7 @@ def _invert(m, out, left, right, det, moved, min_det, guard):
 
 @arithmetic_kernel
 def _load(matrices, first, size, tile, transposed):
-    """Matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
+    """Loads matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
     n = tile.shape[0]
     low = np.uintp(first)
     for i in range(np.uintp(n)):
@@ -170,7 +170,7 @@ def _store(tile, matrices, first, size):
 
 @arithmetic_kernel
 def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
-    """Invert matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
+    """Inverts matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
     n = matrices.shape[1]
     half = n if n <= 4 else (n + 1) // 2
     tile = np.empty((n, n, TILE), matrices.dtype)
@@ -192,7 +192,7 @@ def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
 
 @arithmetic_kernel
 def inverse_gradient_kernel(inverse, grad, out, first, last):
-    """out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
+    """Sets out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
     n = inverse.shape[1]
     x = np.empty((n, n, TILE), inverse.dtype)  # X'
     g, inner, outer = np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype)
@@ -211,8 +211,11 @@ def inverse_gradient_kernel(inverse, grad, out, first, last):
 
 @arithmetic_kernel
 def _load_planes(moments, places, first, size, groups, tile, right, ridge):
-    """A tile (n,n,W) of normal matrices and one (n,W) of right sides of fits first..first+size-1, centroid after centroid;
-    the identity behind them. places (n,n+1): which of a fit's entries; ridge: the share of the mean diagonal added to it."""
+    """Loads a tile (n,n,W) of normal matrices and one (n,W) of right sides of fits first..first+size-1, centroid by centroid.
+
+    The identity stands behind them. places (n,n+1): which of a fit's entries; ridge: the share of the mean diagonal added to
+    it.
+    """
     n = tile.shape[0]
     entries = places[n - 1, n] + 1
     for w in range(size):
@@ -235,7 +238,7 @@ def _load_planes(moments, places, first, size, groups, tile, right, ridge):
 
 @arithmetic_kernel
 def _eliminate(m, sides):
-    """Solve m x = y for a tile (n,n,W) of symmetric positive definite matrices and sides (s,n,W), both overwritten: x where y was.
+    """Solves m x = y for a tile (n,n,W) of symmetric positive definite matrices and sides (s,n,W), which x overwrites.
 
     Without pivoting, which such matrices don't need. What a ridge makes of a rank-deficient matrix has a determinant far
     below float32's rounding of its terms, so no adjugate of it is right; each pivot of this is at least the ridge.
@@ -265,8 +268,10 @@ def _eliminate(m, sides):
 
 @arithmetic_kernel
 def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
-    """Coefficients of fits from their moments (centroids*entries*groups), flat, in the order of `surface_fit`: planes
-    (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse."""
+    """Computes coefficients of fits from their moments (centroids*entries*groups), flat, in the order of `surface_fit`.
+
+    planes (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse.
+    """
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
     tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
@@ -294,9 +299,12 @@ def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
 
 @arithmetic_kernel
 def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad_matrix, grad_right, moved):
-    """The gradient of `solve_planes`: grad (centroids*n*groups) at the planes -> grad_matrix (centroids*n*n*groups), G + G',
-    and grad_right (centroids*n*groups). moved (centroids*groups): the fits whose determinant the guard moved, and on whose
-    plane something depends; their grad_matrix is the caller's to correct (`ops.small_inverses.correct_guarded_gradients`)."""
+    """Computes the gradient of `solve_planes`: grad (centroids*n*groups) at the planes -> grad_matrix, grad_right.
+
+    grad_matrix (centroids*n*n*groups) is G + G', grad_right (centroids*n*groups). moved (centroids*groups): the fits whose
+    determinant the guard moved, and on whose plane something depends; their grad_matrix is the caller's to correct
+    (`ops.small_inverses.correct_guarded_gradients`).
+    """
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
     tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)

@@ -18,7 +18,7 @@ _LOG2E = 1.4426950408889634
 
 @piece_kernel
 def fit_rows(features, bias, floor, xyz, at, times, logits, weights, moments, size, groups, neighbors):
-    """Activate the features and sum up what their plane fits need.
+    """Activates the features and sums up what their plane fits need.
 
     features (R*size*groups): products in, max(products + bias, floor) out; bias (size*groups), floor (groups). xyz (R*3),
     or nothing: coordinates that become group `at`, whose bias is 0 and whose floor is low. times (R). logits (R*groups), or
@@ -66,7 +66,7 @@ def fit_rows(features, bias, floor, xyz, at, times, logits, weights, moments, si
 
 @piece_kernel
 def deviation_rows(features, times, coefficients, out, size, groups, neighbors):
-    """out (R*groups) = A f + b - t for coefficients (centroids*(size+1)*groups) = [A, b]."""
+    """Computes out (R*groups) = A f + b - t for coefficients (centroids*(size+1)*groups) = [A, b]."""
     for p in range(times.size // neighbors):
         plane = p * (size + 1) * groups
         for r in range(p * neighbors, (p + 1) * neighbors):
@@ -81,7 +81,7 @@ def deviation_rows(features, times, coefficients, out, size, groups, neighbors):
 
 @piece_kernel
 def deviation_back(features, grad, out, size, groups, neighbors):
-    """out (centroids*(size+1)*groups) += the gradient at [A, b] from that at the deviations, grad (R*groups)."""
+    """Adds to out (centroids*(size+1)*groups) the gradient at [A, b] from that at the deviations, grad (R*groups)."""
     for p in range(grad.size // groups // neighbors):
         plane = p * (size + 1) * groups
         for r in range(p * neighbors, (p + 1) * neighbors):
@@ -109,7 +109,7 @@ def fit_back(
     groups,
     neighbors,
 ):
-    """Gradients at the products (through the ReLU) and at the logits.
+    """Computes the gradients at the products (through the ReLU) and at the logits.
 
     grad_matrix (centroids*(size+1)^2*groups), made symmetric by the caller (G + G'), and grad_right
     (centroids*(size+1)*groups): of the normal equations. grad_deviations (R*groups), or nothing, with coefficients.

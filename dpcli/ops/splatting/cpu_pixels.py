@@ -41,7 +41,7 @@ def _add(state, at, more):
 
 @_inlined
 def _composite(table, state, low, high, left, top, packed, g, colors, color, channels, number):
-    """One Gaussian, `packed` from g and `colors` from color, onto rows low..high-1 of a tile's state."""
+    """Composites one Gaussian, `packed` from g and `colors` from color, onto rows low..high-1 of a tile's state."""
     one_row = (_2 + channels) * _WIDE
     dx = ramp() + lanes(left - packed[g])
     across_x = lanes(packed[g + _5]) + lanes(packed[g + _2]) * dx * dx
@@ -75,9 +75,9 @@ def _composite(table, state, low, high, left, top, packed, g, colors, color, cha
 
 @parallel_kernel
 def forward(table, tasks, workers, counter, tile_start, gaussian, packed, colors, size, shared, out, alphas, ends):
-    """Composite the tiles in `tasks` (i64): out (C,H,W,D), alphas (C,H,W), and ends (T,TALL,2,8) for `backward`:
+    """Composites the tiles in `tasks` (i64) into out (C,H,W,D), alphas (C,H,W), and ends (T,TALL,2,8), which `backward` reads.
 
-    each pixel's remaining transmittance, and the number (from 1) in the tile's list of the Gaussian before which it
+    ends: each pixel's remaining transmittance, and the number (from 1) in the tile's list of the Gaussian before which it
     stopped. packed, colors, out, alphas, ends are flat; size is C, N, H, W, D; shared: one set of colors for all.
     """
     cameras, count, height, width, depth = size
@@ -138,7 +138,7 @@ def forward(table, tasks, workers, counter, tile_start, gaussian, packed, colors
 def _retrace(
     table, state, lasts, weights, low, high, left, top, packed, g, colors, color, channels, number, to_color, sums, pair
 ):
-    """One Gaussian's gradients from rows low..high-1 of a tile, the state taken back to before it; to `sums` at pair."""
+    """Adds one Gaussian's gradients from rows low..high-1 of a tile to `sums` at pair, the state taken back to before it."""
     one_row = (_3 + channels) * _WIDE
     dx = ramp() + lanes(left - packed[g])
     across_x = lanes(packed[g + _5]) + lanes(packed[g + _2]) * dx * dx
@@ -213,7 +213,7 @@ def backward(
     to_color,
     sums,
 ):
-    """Gradients of pairs: sums (P,max(8,6+D)) of s, s dx, s dy, s dx^2, s dx dy, s dy^2 over pixels, then of the colors.
+    """Computes gradients of pairs (P,max(8,6+D)): sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2 over pixels, then of colors.
 
     s = dL/d(ln alpha), zero where alpha is capped. Walks each list from its far end: B = sum of (weight x color . grad)
     behind a Gaussian gives dL/dalpha = T color . grad - B / (1 - alpha). to_color: else the colors' columns are unset.
@@ -314,7 +314,7 @@ def backward(
 def gather_gradients(
     box, pair_start, sums, conics, opacities, to_color, grad_means, grad_conics, grad_opacities, grad_colors
 ):
-    """Add up each Gaussian's pairs: grad_means (C,N,2), grad_conics (C,N,3); grad_opacities and grad_colors as the inputs.
+    """Adds up each Gaussian's pairs: grad_means (C,N,2), grad_conics (C,N,3); grad_opacities and grad_colors as the inputs.
 
     The last two must be zero; cameras that share them are added in order. sums is flat.
     """

@@ -16,7 +16,7 @@ _BLOCK = 128  # Gaussians a thread takes at once
 
 @arithmetic_kernel
 def _lens(view, K, width, height):
-    """(fx, fy, cx, cy), the least and largest x/z and y/z of the Jacobian, and the rows of W."""
+    """Returns (fx, fy, cx, cy), the least and largest x/z and y/z of the Jacobian, and the rows of W."""
     fx, fy, cx, cy = np.float64(K[0, 0]), np.float64(K[1, 1]), np.float64(K[0, 2]), np.float64(K[1, 2])
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     limits = -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
@@ -35,7 +35,7 @@ def _camera(mean, view):
 
 @arithmetic_kernel
 def _unit(quat):
-    """The unit quaternion and 1 / length."""
+    """Returns the unit quaternion and 1 / length."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     shrink = 1 / max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     return w * shrink, x * shrink, y * shrink, z * shrink, shrink
@@ -58,7 +58,7 @@ def _rotation(w, a, b, c):
 
 @arithmetic_kernel
 def _jacobian(x, y, nearness, lens, limits):
-    """fx/z, -fx tx/z^2, fy/z, -fy ty/z^2, and 1 where tx, ty is not clamped; nearness is 1/z."""
+    """Returns fx/z, -fx tx/z^2, fy/z, -fy ty/z^2, and 1 where tx, ty is not clamped; nearness is 1/z."""
     u, v = x * nearness, y * nearness
     tx, ty = min(max(u, limits[0]), limits[1]), min(max(v, limits[2]), limits[3])
     across, down = lens[0] * nearness, lens[1] * nearness
@@ -67,7 +67,7 @@ def _jacobian(x, y, nearness, lens, limits):
 
 @arithmetic_kernel
 def _rows(jacobian, w):
-    """J W (2,3) as six numbers."""
+    """Returns J W (2,3) as six numbers."""
     a, b, c, d = jacobian[0], jacobian[1], jacobian[2], jacobian[3]
     return (
         a * w[0] + b * w[6],
@@ -81,7 +81,7 @@ def _rows(jacobian, w):
 
 @arithmetic_kernel
 def _turned(p, r):
-    """U = (J W) R (2,3) as six numbers."""
+    """Returns U = (J W) R (2,3) as six numbers."""
     return (
         p[0] * r[0] + p[1] * r[3] + p[2] * r[6],
         p[0] * r[1] + p[1] * r[4] + p[2] * r[7],
@@ -94,7 +94,7 @@ def _turned(p, r):
 
 @arithmetic_kernel
 def _add_quat(w, x, y, z, shrink, g, to_quat):
-    """Add the gradient g (3,3 as nine numbers) of the rotation to to_quat (4): through the unit quaternion, then its length."""
+    """Adds the gradient g (3,3 as nine numbers) of the rotation to to_quat (4), through the unit quaternion and its length."""
     to_w = 2 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     to_x = 2 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]) - 2 * x * (g[4] + g[8]))
     to_y = 2 * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]))
@@ -110,7 +110,7 @@ def _add_quat(w, x, y, z, shrink, g, to_quat):
 def project(
     means, quats, scales, opacities, views, Ks, width, height, near, far, clip, eps, means2d, conics, depths, radii
 ):
-    """Write means2d (C,N,2), conics (C,N,3), depths (C,N) and radii (C,N,2) i32.
+    """Writes means2d (C,N,2), conics (C,N,3), depths (C,N) and radii (C,N,2) i32.
 
     means (1 or C,N,3), quats (.,N,4), scales (.,N,3), opacities (.,N); views (C,4,4) and Ks (C,3,3) f64.
     """
@@ -170,7 +170,7 @@ def project_backward(
     to_quats,
     to_scales,
 ):
-    """Add to to_means, to_quats, to_scales (as the inputs, zero) what comes through means2d, conics and depths."""
+    """Adds to to_means, to_quats, to_scales (as the inputs, zero) what comes through means2d, conics and depths."""
     cameras, count = to_depths.shape
     for block in prange((count + _BLOCK - 1) // _BLOCK):
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):

@@ -16,7 +16,7 @@ _ROUND = 1.5 * 2**23 + 127  # added to a small v, it leaves the nearest integer 
 
 
 def constants(*more: float) -> np.ndarray:
-    """The argument `table` of kernels that call `power`: its constants, then `more`, each eight times; float32."""
+    """Returns the argument `table` of kernels that call `power`: its constants, then `more`, each eight times; float32."""
     return np.repeat(np.float32([-126, _ROUND, 0, *_EXP2, *more]), WIDTH)
 
 
@@ -59,7 +59,7 @@ def _pairs(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, low: list[int], high
 
 @intrinsic
 def totals(typingctx, a, b, c, d, e, f, g, h):
-    """Lane i is the sum of the i-th argument's lanes, always added in the same order."""
+    """Returns a vector whose lane i is the sum of the i-th argument's lanes, always added in the same order."""
     even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]  # each within halves of a register
     left, right = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
 

@@ -28,7 +28,7 @@ _LEAST = np.log(255.0)
 
 @parallel_kernel
 def tile_lists(means2d, conics, opacities, radii, depths, width, height, workers, counter, packed, box, pair_start):
-    """Write packed, box and pair_start (C,N) i64: where a seen Gaussian's pairs begin, one per tile of its box by rows.
+    """Writes packed, box and pair_start (C,N) i64: where a seen Gaussian's pairs begin, one per tile of its box by rows.
 
     means2d (C,N,2), conics (C,N,3), radii (C,N,2) i32, depths (C,N) as i32 bits, counter (1) i64, zero. Returns tasks
     i64, the tiles that hold Gaussians, long lists first; tile_start (T+1) i64 and gaussian (P) i32, the tiles' lists.
@@ -83,7 +83,7 @@ def _pack(mean, conic, opacity, radius, width, height, packed, box):
 
 @arithmetic_kernel
 def _sort(depths, radii, order):
-    """Write the Gaussians with a radius to `order`, by depth, ties by index; return how many. A stable radix sort."""
+    """Writes the Gaussians with a radius to `order`, by depth, ties by index, and returns how many. A stable radix sort."""
     count, seen, size = depths.size, 0, 1 << _DIGIT
     keys, index = np.empty((2, count), np.uint32), np.empty((2, count), np.int32)
     counts = np.zeros((_DIGITS, size), np.int64)
@@ -130,7 +130,7 @@ def _count(listed, box, across, cursor):
 
 @arithmetic_kernel
 def _begin(cursor, first, tile_start):
-    """Turn counts into beginnings: of each block's share of each tile's list, and of its pairs; return P."""
+    """Turns counts into beginnings, of each block's share of each tile's list and of its pairs, and returns P."""
     cameras, workers, tiles = cursor.shape
     at = pair = 0
     for c in range(cameras):
@@ -162,7 +162,7 @@ def _fill(listed, box, across, cursor, pair, gaussian, pair_start):
 
 @arithmetic_kernel
 def _longest_first(tile_start):
-    """The tiles with lists, those twice as long before the others: enough for workers to end together."""
+    """Returns the tiles with lists, those twice as long before the others: enough for workers to end together."""
     tiles, bins = tile_start.size - 1, np.zeros(33, np.int64)
     size = np.empty(tiles, np.int64)
     for tile in range(tiles):

@@ -99,7 +99,7 @@ def rasterization_reference(
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
 ) -> tuple[Tensor, Tensor, dict]:
-    """The torch twin of `rasterization`: same arguments, same result to rounding, on any device and in float64."""
+    """Computes `rasterization` in plain torch, as a reference: same arguments, same result to rounding; any device, float64."""
     return _render(
         True,
         means,
@@ -178,7 +178,7 @@ def _fast(tensor: Tensor) -> bool:
 
 
 def _projection(reference: bool, means: Tensor, viewmats: Tensor) -> Callable:
-    """The CPU form has no gradient for cameras; the reference has."""
+    """Returns the projection to use: the CPU kernel, or the torch reference, which alone has a gradient for cameras."""
     if reference or not _fast(means) or viewmats.requires_grad:
         return project_torch
     from dpcli.ops.splatting.projection import project_numba

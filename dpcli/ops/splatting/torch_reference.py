@@ -46,7 +46,7 @@ def project_torch(
     radius_clip: float,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [C, N, 2], [C, N, 3], [C, N], [C, N, 2] i32
-    """means2d in pixels, conics (xx, xy, yy of the inverse 2D covariance), depths, and radii, 0 of what isn't seen.
+    """Returns means2d in pixels, conics (xx, xy, yy of the inverse 2D covariance), depths, and radii, 0 of what isn't seen.
 
     EWA splatting: the covariance J W R S S R^T W^T J^T + eps2d I, J the projection's Jacobian. Unseen: outside the near
     and far planes, opacity under 1/255, no pixel of the picture within min(3.33, sqrt(2 ln(255 opacity))) standard
@@ -89,7 +89,8 @@ def _radii(means2d, xx, yy, opacities, valid, width: int, height: int, radius_cl
 
 
 def sh_colors(coefficients: Tensor, means: Tensor, viewmats: Tensor, degree: int) -> Tensor:
-    """Colors (1 or C,N,3) of SH coefficients (1 or C,N,K,3) seen from the cameras: max(0, 0.5 + sum of c_k Y_k(direction)).
+    """Returns colors (1 or C,N,3) of SH coefficients (1 or C,N,K,3) seen from the cameras: max(0, 0.5 + sum c_k
+    Y_k(direction)).
 
     means (1 or C,N,3); real harmonics of degree 0..3 as in 3D Gaussian splatting, direction from camera to Gaussian.
     """
@@ -102,7 +103,7 @@ def sh_colors(coefficients: Tensor, means: Tensor, viewmats: Tensor, degree: int
 
 
 def sh_basis(direction: Tensor, degree: int) -> Tensor:
-    """The real spherical harmonics (...,(degree+1)^2) of unit directions (...,3), degree 0..3."""
+    """Returns the real spherical harmonics (...,(degree+1)^2) of unit directions (...,3), degree 0..3."""
     x, y, z = direction.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     bands = [
@@ -134,7 +135,7 @@ def pixels_torch(
     height: int,
     tile_size: int = 16,
 ) -> tuple[Tensor, Tensor]:  # [C, H, W, D], [C, H, W, 1]
-    """Composited colors (no background) and alphas. Front to back by depth, ties to the lower index."""
+    """Returns composited colors (no background) and alphas. Front to back by depth, ties to the lower index."""
     cameras = len(means2d)
     shared = (t.expand(cameras, *t.shape[1:]) for t in (colors, opacities))
     each = zip(means2d, conics, *shared, radii, depths, strict=True)
@@ -160,7 +161,7 @@ def _one_camera(means2d, conics, colors, opacities, radii, depths, width: int, h
 
 
 def _tile(means2d, conics, colors, opacities, columns: tuple[int, int], rows: tuple[int, int]) -> Tensor:
-    """Colors and alpha (h,w,D+1) of one tile: all its pixels against all its Gaussians, sorted from near to far."""
+    """Returns colors and alpha (h,w,D+1) of one tile: all its pixels against all its Gaussians, sorted from near to far."""
     at = {"dtype": means2d.dtype, "device": means2d.device}
     y, x = torch.meshgrid(torch.arange(*rows, **at) + 0.5, torch.arange(*columns, **at) + 0.5, indexing="ij")
     dx, dy = x[..., None] - means2d[:, 0], y[..., None] - means2d[:, 1]

@@ -50,7 +50,7 @@ ABSENT = (
 
 
 def published_names() -> list[str]:
-    """Names ``aAA_sSS_eEE`` of the 567 videos that the authors published (of 20 x 10 x 3 recorded)."""
+    """Returns the names ``aAA_sSS_eEE`` of the 567 videos that the authors published (of 20 x 10 x 3 recorded)."""
     every = [(a, s, e) for a in range(1, 21) for s in range(1, 11) for e in range(1, 4)]
     return [f"a{a:02}_s{s:02}_e{e:02}" for a, s, e in every if not {(a, s, e), (a, s, 0)} & set(ABSENT)]
 

@@ -130,7 +130,7 @@ def _words(gesture: Sequence[int]) -> str:
 
 
 def gesture_names(lists: Sequence[ListFile], labels: int) -> list[str]:
-    """Names of the 14 or 28 classes in the order of their labels, as the lists pair labels with gestures and fingers.
+    """Returns the names of the 14 or 28 classes in label order, as the lists pair labels with gestures and fingers.
 
     A class that no line has is called ``class N``, N from 1.
     """

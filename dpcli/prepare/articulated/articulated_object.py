@@ -116,7 +116,7 @@ def axis_rotation(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def transform(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Apply motions (...,4,4) to points (...,3), row by row."""
+    """Applies motions (...,4,4) to points (...,3), row by row."""
     return (motions[..., :3, :3] @ points[..., None])[..., 0] + motions[..., :3, 3]
 
 

@@ -131,7 +131,7 @@ def draw_sequence(
 
 
 def _normalized(obj: ArticulatedObject, poses: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale of the bodies, and body poses f64 (F,bodies,4,4) of the scaled bodies: still rigid, frame 0 centered."""
+    """Returns the scale of the bodies, and poses f64 (F,bodies,4,4) of the scaled bodies: still rigid, frame 0 centered."""
     center, radius = obj.extent(poses[0])
     scale = 0.5 / radius
     poses = poses.copy()

@@ -57,10 +57,10 @@ class Skeleton:
 
 
 def read_skeleton(path: Path, root: Path | None = None) -> Skeleton:
-    """Parse a URDF and merge links joined by fixed joints. Raises DataError when it isn't a tree of links.
+    """Parses a URDF and merges links joined by fixed joints. Raises DataError when it isn't a tree of links.
 
     Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; where one of two limits is
-    given the other is 0, as the format has it; inverted ones are swapped; of more than a turn the one about 0 is taken;
+    given the other is 0, as the format says; inverted ones are swapped; of more than a turn the one about 0 is taken;
     a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
     root: its meshes must lie in it.
     """

@@ -46,7 +46,7 @@ class _Element:
 
 
 class _Array(np.ndarray):
-    """An array whose state, when a pickle puts it in, is checked before NumPy's C code gets it."""
+    """Checks the state that a pickle puts into an array before NumPy's C code gets it."""
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         """Takes shape and values. Raises UnpicklingError where they don't fit each other."""
@@ -60,7 +60,7 @@ class _Array(np.ndarray):
 
 
 class _Name:
-    """A name of the allow list: it can be called and nothing else, for no state goes into it and it is no class."""
+    """Stands for a name of the allow list: it can be called and nothing else, for no state goes into it and it is no class."""
 
     __slots__ = ("_make",)
 

@@ -91,7 +91,7 @@ def parts_of_boxes(points: np.ndarray, boxes: list[Box]) -> np.ndarray:
 
 
 def read_lists(folder: Path) -> dict[str, str]:
-    """Name of a scan -> split, from train.txt and val.txt of a folder; empty when neither is there."""
+    """Returns a mapping from scan names to splits, from train.txt and val.txt of a folder; empty when neither is there."""
     found: dict[str, str] = {}
     for key, split in _SPLITS.items():
         path = folder / f"{key}.txt"

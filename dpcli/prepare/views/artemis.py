@@ -290,9 +290,7 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
 
 
 def _check_tracks(motion: Motion, frame: int, view: int, rig: _Rig, points: np.ndarray) -> None:
-    """Warn when the skinned voxels do not project into the silhouette: then cameras or bones are of another
-    convention.
-    """
+    """Warns when the skinned voxels do not project into the silhouette: then cameras or bones are of another convention."""
     alpha = _alpha(motion, frame, view)[..., 3]
     seen = points @ rig.poses[view][:3, :3].T + rig.poses[view][:3, 3]
     pixel = seen @ rig.intrinsics[view].T

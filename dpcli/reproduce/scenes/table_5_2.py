@@ -94,7 +94,7 @@ def mean_score(values: list[dict], *keys: str) -> float:
 
 
 def table(scores: dict[str, list[dict]], clips: int) -> str:
-    """Markdown, one line per row, means over clips; the thesis's values beside, on its own data and protocol."""
+    """Returns Markdown, one line per row, means over clips; the thesis's values stand beside, on its own data and protocol."""
     lines = [
         f"Means over {clips} clips; views that no fit sees. Thesis: its own data, reference view.",
         "",

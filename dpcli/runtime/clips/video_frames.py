@@ -171,7 +171,7 @@ def _streams(container) -> list:  # of av.VideoStream
 
 
 def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
-    """Yields the frames that play. DataError at one that can't be decoded; before the first, such packets are passed over."""
+    """Yields the frames that play. Raises DataError at one that can't be decoded; such packets before the first are skipped."""
     import av
 
     context = stream.codec_context
@@ -194,7 +194,7 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
 
 
 def _packets_with_bytes(path: Path, container, stream) -> Iterator:  # of av.Packet
-    """Yields the packets of a stream. DataError where what lies between two of them is damaged.
+    """Yields the packets of a stream. Raises DataError where what lies between two of them is damaged.
 
     One without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
     """

@@ -37,12 +37,12 @@ class Given:
 
     @property
     def values(self) -> dict[str, Any]:
-        """All values by public name; those of `--set` and of flags stand over the file's."""
+        """Returns all values by public name; those of `--set` and of flags take precedence over the file's."""
         return {**self.config, **self.sets, **self.flags}
 
 
 class Catalog:
-    """The settings of one command in named groups, as in `Catalog(network=KinetConfig, schedule=Schedule)`.
+    """Holds the settings of one command in named groups, as in `Catalog(network=KinetConfig, schedule=Schedule)`.
 
     groups: name -> dataclass. settings: public name -> Setting. Raises ValueError when two settings, or a setting and a
     group, have one name.
@@ -58,7 +58,7 @@ class Catalog:
                 self.settings[one.name] = one
 
     def find(self, name: str) -> Setting:
-        """Return the setting of that name, with dashes or underscores. Raises UsageError that tells the nearest name."""
+        """Returns the setting of that name, with dashes or underscores. Raises UsageError that names the nearest name."""
         found = self.settings.get(_plain(name))
         if found is None:
             near = self._nearest(name)
@@ -67,7 +67,7 @@ class Catalog:
         return found
 
     def parse_set(self, words: Sequence[str]) -> dict[str, Any]:
-        """Return values by public name from words NAME=VALUE. Raises UsageError for a word that is wrong or repeats."""
+        """Returns values by public name from words NAME=VALUE. Raises UsageError for a word that is wrong or repeats."""
         said: dict[str, str] = {}
         values: dict[str, Any] = {}
         for word in words:
@@ -85,7 +85,7 @@ class Catalog:
         return values
 
     def read_config(self, path: str | Path) -> dict[str, Any]:
-        """Return values by public name from a TOML file, whose tables are groups; keys outside of tables are legal too.
+        """Returns values by public name from a TOML file, whose tables are groups; keys outside of tables are legal too.
 
         Raises DataError when there is no such file or it is not TOML, UsageError, which names it, when it says something illegal.
         """
@@ -102,7 +102,7 @@ class Catalog:
         return values
 
     def resolve(self, base: Mapping[str, Any], given: Given) -> dict[str, Any]:
-        """Return the base's instances, group -> instance, with what was given over them.
+        """Returns the base's instances, group -> instance, with what was given over them.
 
         base: instances of a preset. Raises UsageError from the dataclasses' own checks.
         """
@@ -114,7 +114,7 @@ class Catalog:
         return {group: dataclasses.replace(instance, **changes[group]) for group, instance in base.items()}
 
     def to_toml(self, instances: Mapping[str, Any], command: str, helps: bool = True) -> str:
-        """Return the settings of the instances as TOML: one table a group, which `read_config` reads back.
+        """Returns the settings of the instances as TOML: one table a group, which `read_config` reads back.
 
         command: its words, such as `classify train`. helps: whether each setting's help stands above it as a comment.
         """
@@ -128,7 +128,7 @@ class Catalog:
         return "\n".join(lines) + "\n"
 
     def _entries(self, table: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-        """Yield place, name and value of each entry, those of the groups' tables too."""
+        """Yields place, name and value of each entry, those of the groups' tables too."""
         for key, value in table.items():
             if not isinstance(value, dict) or _plain(key) in self.settings:
                 yield key, key, value
@@ -138,7 +138,7 @@ class Catalog:
                 raise UsageError(f"unknown table [{shown(key)}]; expected one of {', '.join(self.groups)}")
 
     def _nearest(self, name: str) -> str | None:
-        """Return the public name most like this one, which may be meant for a field's name; None when none is alike."""
+        """Returns the public name most like this one, which may be meant for a field's name; None when none is alike."""
         public = {one.field: one.name for one in self.settings.values()} | {name: name for name in self.settings}
         return public.get(nearest(_plain(name), public) or "")
 

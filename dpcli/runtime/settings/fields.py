@@ -37,7 +37,7 @@ def setting(
     below: float | None = None,
     name: str | None = None,
 ) -> Any:
-    """Return a dataclass field that users may set.
+    """Returns a dataclass field that users may set.
 
     default: the value without a preset. help: one or two sentences. least, most, above, below: bounds of the number, or of
     each number in a tuple; `least` and `most` are legal themselves. name: what users call it where not by the field's name.
@@ -48,7 +48,7 @@ def setting(
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting as users see it: public name, field, type, default, help and bounds."""
+    """Describes one setting as users see it: public name, field, type, default, help and bounds."""
 
     name: str
     field: str
@@ -61,7 +61,7 @@ class Setting:
     below: float | None = None
 
     def parse(self, text: str) -> Any:
-        """Return the value that the text of a command line stands for. Raises UsageError when it is not legal."""
+        """Returns the value that the text of a command line stands for. Raises UsageError when it is not legal."""
         try:
             value = kinds.read_text(text if self.hint is str else text.strip(), self.hint)
         except ValueError:
@@ -69,14 +69,14 @@ class Setting:
         return self.checked(value, text)
 
     def from_toml(self, value: Any) -> Any:
-        """Return the value of a TOML file in the setting's type. Raises UsageError when it is not legal."""
+        """Returns the value of a TOML file in the setting's type. Raises UsageError when it is not legal."""
         try:
             return self.checked(kinds.read_toml_value(value, self.hint))
         except ValueError:
             raise self.refused(value) from None
 
     def checked(self, value: Any, text: str | None = None) -> Any:
-        """Return the value, a whole number as float where one is expected. Raises UsageError when it is not legal.
+        """Returns the value, a whole number as float where one is expected. Raises UsageError when it is not legal.
 
         text: how the user wrote it, for the message.
         """
@@ -92,14 +92,14 @@ class Setting:
 
     @property
     def bounds(self) -> str:
-        """The legal range in words, such as `at least 0 and below 1`; nothing where every number is legal."""
+        """Returns the legal range in words, such as `at least 0 and below 1`; nothing where every number is legal."""
         limits = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
         return " and ".join(
             f"{words} {kinds.write_text(limit)}" for words, limit in limits.items() if limit is not None
         )
 
     def _problem(self, number: float) -> str:
-        """Return what was expected instead of this number; nothing when it is legal."""
+        """Returns what was expected instead of this number; nothing when it is legal."""
         legal = (
             (self.least is None or number >= self.least)
             and (self.most is None or number <= self.most)
@@ -115,7 +115,7 @@ class Setting:
         return "" if abs(number) < LARGEST else f"a finite number below {LARGEST:g}"
 
     def refused(self, value: Any) -> UsageError:
-        """The error for a value of another type, with the nearest word or an example."""
+        """Returns the error for a value of another type, with the nearest word or an example."""
         legal, more = kinds.words_of(self.hint), ""
         if isinstance(value, str) and (near := nearest(value, legal)):
             more = f"; did you mean {near}?"
@@ -127,7 +127,7 @@ class Setting:
 
 @cache
 def settings_of(cls: type) -> tuple[Setting, ...]:
-    """Return the settings among the fields of a dataclass. Raises TypeError for a type that no setting may have."""
+    """Returns the settings among the fields of a dataclass. Raises TypeError for a type that no setting may have."""
     hints, found = get_type_hints(cls), []
     for one in dataclasses.fields(cls):
         if "setting" in one.metadata:
@@ -138,7 +138,7 @@ def settings_of(cls: type) -> tuple[Setting, ...]:
 
 
 def check(instance: Any) -> None:
-    """Raise UsageError when a setting of the dataclass instance has a wrong type, word or range; for `__post_init__`."""
+    """Raises UsageError when a setting of the dataclass instance has a wrong type, word or range; for `__post_init__`."""
     for one in settings_of(type(instance)):
         value = getattr(instance, one.field)
         if one.checked(value) != value:  # a list, which a file may have for a tuple
@@ -146,14 +146,14 @@ def check(instance: Any) -> None:
 
 
 def nearest(word: str, legal: Iterable[str]) -> str | None:
-    """Return the legal word most like this one, or None when none is alike."""
+    """Returns the legal word most like this one, or None when none is alike."""
     from difflib import get_close_matches
 
     return next(iter(get_close_matches(word[:_SHOWN], list(legal), 1, 0.5)), None)
 
 
 def shown(value: Any) -> str:
-    """Return the value as a person wrote it, or as Python does where it would be hard to see; never long."""
+    """Returns the value as a person wrote it, or as Python does where it would be hard to see; never long."""
     text = value if isinstance(value, str) else repr(value) if isinstance(value, dict) else kinds.write_text(value)
     text = text if text.strip() and text.isprintable() else repr(text)
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

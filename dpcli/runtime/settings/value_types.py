@@ -19,22 +19,22 @@ _METAVAR = {bool: "[true|false]", int: "<int>", float: "<float>", str: "<str>"}
 
 
 def may_be_none(hint: Any) -> bool:
-    """Return whether None is a value of this type."""
+    """Returns whether None is a value of this type."""
     return get_origin(hint) in (Union, types.UnionType) and type(None) in get_args(hint)
 
 
 def without_none(hint: Any) -> Any:
-    """Return the type of the values that are not None."""
+    """Returns the type of the values that are not None."""
     return next(one for one in get_args(hint) if one is not type(None)) if may_be_none(hint) else hint
 
 
 def is_tuple(hint: Any) -> bool:
-    """Return whether values other than None are tuples."""
+    """Returns whether values other than None are tuples."""
     return get_origin(without_none(hint)) is tuple
 
 
 def check_hint(hint: Any) -> None:
-    """Raise TypeError when the type is none of those a setting may have, or could not be told from None in writing."""
+    """Raises TypeError when the type is none of those a setting may have, or could not be told from None in writing."""
     if may_be_none(hint) and NONE in get_args(without_none(hint)):
         raise TypeError(f"{hint}: the word {NONE!r} and None would be written alike")
     inner = without_none(hint)
@@ -46,7 +46,7 @@ def check_hint(hint: Any) -> None:
 
 
 def accept(value: Any, hint: Any) -> Any:
-    """Return the value in the type's own form: lists become tuples, and whole numbers floats where floats are expected.
+    """Returns the value in the type's own form: lists become tuples, and whole numbers floats where floats are expected.
 
     Raises ValueError for a value of another type. A bool is no number, and `none` is no text where it stands for None.
     """
@@ -66,7 +66,7 @@ def accept(value: Any, hint: Any) -> Any:
 
 
 def read_text(text: str, hint: Any) -> Any:
-    """Return the value that the text of a command line stands for. Raises ValueError where it stands for none."""
+    """Returns the value that the text of a command line stands for. Raises ValueError where it stands for none."""
     if may_be_none(hint):
         return None if text == NONE else read_text(text, without_none(hint))
     if get_origin(hint) is Literal:
@@ -80,19 +80,19 @@ def read_text(text: str, hint: Any) -> Any:
 
 
 def read_toml_value(value: Any, hint: Any) -> Any:
-    """Return the setting's value for one of a TOML file. Raises ValueError for a value of another type."""
+    """Returns the setting's value for one of a TOML file. Raises ValueError for a value of another type."""
     return None if may_be_none(hint) and value == NONE else accept(value, hint)
 
 
 def write_text(value: Any) -> str:
-    """Return the text that `read_text` reads back."""
+    """Returns the text that `read_text` reads back."""
     if isinstance(value, (list, tuple)):
         return ("/" if any(isinstance(one, (list, tuple)) for one in value) else ",").join(map(write_text, value))
     return NONE if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def write_toml_value(value: Any) -> str:
-    """Return the value as TOML, which `read_toml_value` reads back."""
+    """Returns the value as TOML, which `read_toml_value` reads back."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(write_toml_value, value))}]"
     if isinstance(value, str) or value is None:
@@ -101,7 +101,7 @@ def write_toml_value(value: Any) -> str:
 
 
 def numbers_in(value: Any) -> Iterator[int | float]:
-    """Yield the numbers of a value, those in tuples too."""
+    """Yields the numbers of a value, those in tuples too."""
     if isinstance(value, (list, tuple)):
         for one in value:
             yield from numbers_in(one)
@@ -110,14 +110,14 @@ def numbers_in(value: Any) -> Iterator[int | float]:
 
 
 def words_of(hint: Any) -> tuple[str, ...]:
-    """Return all texts that are legal, where they can be listed: of a Literal or a bool; else nothing."""
+    """Returns all texts that are legal, where they can be listed: of a Literal or a bool; else nothing."""
     inner = without_none(hint)
     values = get_args(inner) if get_origin(inner) is Literal else (True, False) if inner is bool else ()
     return tuple(write_text(value) for value in values) + ((NONE,) if values and may_be_none(hint) else ())
 
 
 def describe(hint: Any) -> str:
-    """Return what an error message says was expected: `a whole number`, `one of a, b`, `2 numbers`."""
+    """Returns what an error message says was expected: `a whole number`, `one of a, b`, `2 numbers`."""
     if may_be_none(hint) and not words_of(hint):
         return f"{describe(without_none(hint))} or {NONE}"
     if get_origin(hint) is tuple:
@@ -126,7 +126,7 @@ def describe(hint: Any) -> str:
 
 
 def metavar(hint: Any) -> str:
-    """Return what stands for the value in a list of options: `<int>`, `[a|b]`, `<float>,<float>`, as typer does."""
+    """Returns what stands for the value in a list of options: `<int>`, `[a|b]`, `<float>,<float>`, as typer does."""
     if words_of(hint):
         return f"[{'|'.join(words_of(hint))}]"
     if may_be_none(hint):
@@ -146,7 +146,7 @@ def _describe_tuple(items: tuple[Any, ...]) -> str:
 
 
 def _items(hint: Any, count: int) -> list[Any]:
-    """Return the type of each of so many items of a tuple. Raises ValueError for another count than the type's."""
+    """Returns the type of each of so many items of a tuple. Raises ValueError for another count than the type's."""
     items = list(get_args(hint))
     if items[-1] is ...:
         return [items[0]] * count
@@ -156,7 +156,7 @@ def _items(hint: Any, count: int) -> list[Any]:
 
 
 def _first(values: Iterator[Any]) -> Any:
-    """Return the first of the values. Raises ValueError when there is none."""
+    """Returns the first of the values. Raises ValueError when there is none."""
     for value in values:
         return value
     raise ValueError("no such word")
@@ -170,5 +170,5 @@ def _as_float(value: int) -> float:
 
 
 def _is_unicode(text: str) -> bool:
-    """Return whether the text can be written as UTF-8; a path with bytes of another encoding can't."""
+    """Returns whether the text can be written as UTF-8; a path with bytes of another encoding can't."""
     return not any("\ud800" <= letter <= "\udfff" for letter in text)

@@ -118,5 +118,5 @@ def _joint_json(joint: PartJoint, tree: KinematicTree) -> dict[str, Any]:
 
 
 def write_trees(path: Path, trees: list[dict[str, Any]]) -> None:
-    """Writes the objects of `tree_json` as one JSON list, whole or not at all. DpcError where it can't be written."""
+    """Writes the objects of `tree_json` as one JSON list, whole or not at all. Raises DpcError where it can't be written."""
     write_whole(path, (json.dumps(trees, indent=1, allow_nan=False) + "\n").encode("utf-8"))

@@ -34,7 +34,7 @@ class MultibodySegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
-        """The most bodies of a sequence."""
+        """Returns the most bodies of a sequence."""
         return self.settings.most_bodies
 
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:

@@ -90,7 +90,7 @@ def rotation_loss(
     """Returns the squared error of the residual at the labeled pair plus 0.1 of the confidences' cross-entropy.
 
     rotation (B,S,3,3): each part's from frame 1 to 2. weight (B,S): how much each counts, e.g. its share of the points.
-    The error is taken at the labeled pair only, as the release has it.
+    The error is taken at the labeled pair only, as in the release.
     """
     label, wanted = relative_labels(rotation.mT, group)
     at = residual.gather(3, label[..., None, None].expand(*label.shape, 1, 4)).squeeze(3)

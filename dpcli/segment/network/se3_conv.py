@@ -18,7 +18,7 @@ from dpcli.segment.network.neighborhood import Neighborhood, kernel_weights
 
 
 class SpatialConv(nn.Module):
-    """Convolves over space with rotated kernels (as EPN has it), without bias.
+    """Convolves over space with rotated kernels (as in EPN), without bias.
 
     out[p,a,c'] = sum_{c,k} W[c,k,c'] sum_n w(x_n - x_p - R_a k) f[n,a,c]. features (B,N,G,C) or None for the constant 1
     of a first layer -> (B,P,G,C').
@@ -70,7 +70,7 @@ class SpatialConv(nn.Module):
 
 
 class GroupConv(nn.Module):
-    """Convolves over the rotation group (as EPN has it), without bias.
+    """Convolves over the rotation group (as in EPN), without bias.
 
     out[p,a,c'] = sum_{c,q} W[q,c,c'] f[p, a q, c] over the nearby elements q. (B,P,G,C) -> (B,P,G,C').
     """

@@ -29,7 +29,7 @@ class SceneSegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
-        """The background and the most objects of a sequence."""
+        """Returns how many objects a sequence may have at most, the background included."""
         return self.settings.most_objects + 1
 
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:

@@ -38,7 +38,7 @@ class MovingObject:
 
     @property
     def size(self) -> int:
-        """The number of its points in all frames."""
+        """Returns the number of its points in all frames."""
         return sum(map(len, self.points.values()))
 
     def between(self, source: int, target: int) -> np.ndarray:

@@ -38,7 +38,7 @@ class Frame:
 
     @cached_property
     def raised(self) -> np.ndarray:
-        """Numbers of the points above the ground, i64."""
+        """Returns the indices of the points above the ground, i64."""
         return np.flatnonzero(self.height >= self.raised_above)
 
     @cached_property

@@ -108,7 +108,7 @@ def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.n
 
 
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
-    """Opens an array file, and reserves its room on the disk at once."""
+    """Opens an array file and reserves its bytes on the disk at once."""
     try:
         array = _map_file(path, shape, dtype, fresh)
         with path.open("r+b") as file:

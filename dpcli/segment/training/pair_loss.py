@@ -32,7 +32,7 @@ class Batch:
 
     @property
     def other(self) -> Tensor:
-        """The points of each frame's counterpart."""
+        """Returns the points of each frame's counterpart."""
         return swap(self.points)
 
 

@@ -18,11 +18,11 @@ _NAMED = 4  # differences that a refusal names
 
 
 class HasProvenance(Protocol):
-    """A reader that knows the commands that led to its file, oldest first."""
+    """Describes a reader that knows the commands that led to its file, oldest first."""
 
     @property
     def provenance(self) -> list[dict]:
-        """The entries as `runtime.provenance.record` makes them."""
+        """Returns the entries as `runtime.provenance.record` makes them."""
 
 
 def already_made(

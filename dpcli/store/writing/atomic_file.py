@@ -29,7 +29,7 @@ class _HeldOpen(h5py.File):
 
 
 class AtomicFile:
-    """An HDF5 file written beside its target (`.NAME.part`, or another suffix) and renamed when whole.
+    """Writes an HDF5 file beside its target (`.NAME.part`, or another suffix) and renames it when whole.
 
     A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes.
     Write errors become DpcError with the reason in words. As a context manager it gives the open HDF5 file, and commits
@@ -71,7 +71,7 @@ class AtomicFile:
             self.failed(kind, error, trace)
 
     def problem(self, error: BaseException | None, kept: str = "") -> DpcError | None:
-        """Returns a DpcError for a write that found no room, None when `error` is something else.
+        """Returns a DpcError for a write that found the disk full, None when `error` is something else.
 
         kept: what stays for a run that continues, in words. It writes that once more and the rest, `needed` bytes.
         """

@@ -42,7 +42,7 @@ class Journal:
     what an earlier run left points into, "" when there is nothing of this very work; `other` is the `about` of samples
     of other work, None when there are none. To continue: `samples()`, given to a writer with a journal of its own, which
     then takes the place of this one (`replace`). Else `begin` empties it.
-    DpcError when another process holds the file. Layout: a magic line, then records of length, checksum, JSON and
+    Raises DpcError when another process holds the file. Layout: a magic line, then records of length, checksum, JSON and
     arrays; the first is `about` and `data_name`.
     """
 

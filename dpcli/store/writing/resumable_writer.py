@@ -27,7 +27,7 @@ _STILL_KEPT = (
 
 
 class ResumableWriter(ABC):
-    """Context manager that writes `path` through a file beside it renamed when whole.
+    """Writes `path` through a file beside it that is renamed when whole, as a context manager.
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
     written survives a stop (Stopped, KeyboardInterrupt, a full disk, or any exception once `keep` is set) and a kill at any

@@ -71,7 +71,7 @@ class PlainChunks:
 
 
 class WholeChunks(PlainChunks):
-    """The fast form: chunks go to the file at once, past HDF5's cache, and their places are known."""
+    """Writes chunks to the file at once, past HDF5's cache, so that their places are known: the fast form."""
 
     def __init__(self, data: h5py.Dataset) -> None:
         super().__init__(data)

@@ -195,7 +195,7 @@ class InputTransform(nn.Module):
         self.matrix = ClipLinear((third, *hidden)[-1], 9)
 
     def forward(self, points: Tensor, idx: Tensor) -> Tensor:
-        """Points (B,N,3), neighbors (B,N,K) -> points (B,N,3) times the matrix."""
+        """Returns points (B,N,3) times the learned matrix, from points (B,N,3) and their neighbors (B,N,K)."""
         pooled = self.point.pool(self.edges.pool(points, points, idx, points))
         matrix = self.matrix(self.hidden(pooled)).view(-1, 3, 3)
         return full_precision(torch.matmul)(points, matrix + torch.eye(3).to(matrix))
@@ -226,7 +226,7 @@ class DGCNN(Backbone):
         return [Grouping(points, times, points, times, self._graph(points, times))]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C)."""
+        """Returns class logits (B,C)."""
         group = groups[0]
         features, levels = self.transform(group.points, group.idx), []
         for conv in self.convs:

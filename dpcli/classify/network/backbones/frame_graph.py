@@ -23,7 +23,10 @@ _PIECE = 1 << 18  # gathered numbers between two poolings, which then stay in th
 
 
 def frame_size(times: Tensor) -> int:
-    """Points a frame of a cloud whose frames follow one another and are equally large; times (B,N). ValueError otherwise."""
+    """Returns the number of points per frame of a cloud whose frames follow one another and are equally large; times (B,N).
+
+    Raises ValueError for any other cloud.
+    """
     size = int((times[0] == times[0, 0]).sum())
     expected = times[:, :1] + torch.arange(times.shape[1], device=times.device) // size
     if times.shape[1] % size or not torch.equal(times, expected.to(times)):
@@ -117,7 +120,7 @@ def _own_first(offset: int) -> tuple[int, int]:
 
 
 def _between(blocks: Tensor, offset: int, shares: list[dict[int, int]]) -> tuple[Tensor, Tensor]:
-    """Distances and indices (B,T,P,n) of each point's nearest in the frame at `offset`; infinite beyond its share."""
+    """Returns distances and indices (B,T,P,n) of each point's nearest in the frame at `offset`; infinite beyond its share."""
     batch, frames, size, channels = blocks.shape
     wanted = [row.get(offset, 0) for row in shares]
     most = min(max(wanted), size)

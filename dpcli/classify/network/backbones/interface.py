@@ -27,7 +27,7 @@ BACKBONES = {
 
 @dataclass
 class Grouping:
-    """Centroids of one stage and their neighbors among its points. Frame numbers are float."""
+    """Holds the centroids of one stage and their neighbors among its points. Frame numbers are float."""
 
     points: Tensor  # (B,N,3) what is grouped
     times: Tensor  # (B,N)
@@ -65,11 +65,11 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """Neighborhoods that follow from positions alone. points (B,N,3) of all frames, times (B,N) their frame numbers."""
+        """Returns neighborhoods, which follow from positions alone. points (B,N,3) of all frames, times (B,N) frame numbers."""
 
     @abstractmethod
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C): what the static stream is trained with."""
+        """Returns class logits (B,C), which the static stream is trained with."""
 
     @abstractmethod
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:

@@ -50,8 +50,10 @@ class PointSlots(Backbone):
         return [Grouping(points, times, points[:, :0], times[:, :0], nothing)]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C): the logarithm of the mean scores of the members that `_voting_members` names; of a clip without any
-        point all classes alike."""
+        """Returns class logits (B,C): the logarithm of the mean scores of the members that `_voting_members` names.
+
+        All classes are alike for a clip without any point.
+        """
         clips = torch.cat([groups[0].points, groups[0].columns], -1)
         clips = clips.unflatten(1, (self.config.num_frames, self.config.points_per_frame))
         voting = self._voting_members(clips[..., 3].amax((1, 2)).long() - 2)

@@ -73,7 +73,7 @@ class SpiderConv(nn.Module):
 
 
 def _modulated(gathered: Tensor, taylor: Tensor, k: int) -> Tensor:
-    """Features of the k-th neighbors times each of their Taylor channels, (B,N,C*T)."""
+    """Returns the features of the k-th neighbors times each of their Taylor channels, (B,N,C*T)."""
     return (gathered[:, :, k, :, None] * taylor[:, :, k, None, :]).flatten(2)
 
 
@@ -159,7 +159,7 @@ def _by_taylor_channel(kernel: Tensor, taylor: Tensor) -> Tensor:
 
 
 def _pieces(gathered: Tensor, taylor: Tensor) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
-    """Rows of all clips, a cacheful at a time: which, their features, their Taylor channels, and room for their product."""
+    """Yields blocks of all clips' rows that fit the cache: rows, features, Taylor channels, and a buffer for their product."""
     gathered, taylor = gathered.flatten(0, 1), taylor.flatten(0, 1)
     width = (taylor.shape[-1], gathered.shape[-1])
     step = max(1, _PIECE // (width[0] * width[1]))
@@ -204,7 +204,7 @@ class SpiderCNN(Backbone):
         return [Grouping(points, times, points, times, idx)]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C)."""
+        """Returns class logits (B,C)."""
         group, levels = groups[0], []
         features, offsets = group.points, monomials(group.relative())
         for conv in self.convs:

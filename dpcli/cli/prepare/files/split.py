@@ -40,7 +40,7 @@ class SplitOptions:
     seed: Seed = 0
 
     def choice(self) -> SplitChoice:
-        """Returns these options as the room takes them."""
+        """Returns these options as `dpcli.prepare` takes them."""
         from dpcli.prepare.commands.split import SplitChoice
 
         named = {

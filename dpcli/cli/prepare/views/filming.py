@@ -61,7 +61,7 @@ class FilmingOptions:
     seed: Seed = 0
 
     def filming(self, yaw: float) -> Filming:
-        """Returns these options as the room takes them. yaw: the angle, degrees, where none was given.
+        """Returns these options as `dpcli.prepare` takes them. yaw: the angle, degrees, where none was given.
 
         Raises UsageError when no output was named.
         """

@@ -28,7 +28,7 @@ LONGEST = 256  # frames of a video that is one clip: its activations take 7 MB e
 
 
 def build_network(name: str) -> torch.nn.Module:
-    """Returns the network of a variant with random weights. UsageError for styleganv, whose network is a file."""
+    """Returns the network of a variant with random weights. Raises UsageError for styleganv, whose network is a file."""
     from dpcli.evaluate.networks.i3d import I3D
     from dpcli.evaluate.networks.inception import FidInception
     from dpcli.evaluate.networks.resnet3d import ResNet3D50
@@ -110,7 +110,7 @@ class ClipFeatures:
             self._take_clip()
 
     def restart(self) -> None:
-        """Says that frames are missing here: no window reaches across. DataError for a variant whose clip is the whole video."""
+        """Says that frames are missing here: no window reaches across. Raises DataError where a clip is the whole video."""
         variant = self.network.variant
         if variant.clip is None:
             raise DataError(
@@ -122,7 +122,7 @@ class ClipFeatures:
             self._row = self._new = 0
 
     def result(self) -> FeatureStatistics:
-        """Ends the video and returns the statistics of its clips. DataError when it had too few frames."""
+        """Ends the video and returns the statistics of its clips. Raises DataError when it had too few frames."""
         variant = self.network.variant
         if self._longest < variant.least:
             had = f"{self._longest} frames{' in a row' if self._longest < self.frames else ''}"
@@ -163,7 +163,7 @@ class VideoFeatures:
             side.restart()
 
     def result(self) -> VideoPair:
-        """Ends both videos and returns their statistics. DataError when there were too few frames."""
+        """Ends both videos and returns their statistics. Raises DataError when there were too few frames."""
         predicted, truth = (side.result() for side in self._sides)
         return VideoPair(predicted, truth, self._sides[0].used)
 
@@ -183,7 +183,7 @@ class FeatureDistance:
 def video_distance(variant: FeatureVariant, pairs: Sequence[VideoPair], root: str | None = None) -> FeatureDistance:
     """Returns the variant's distance over videos (views, objects), as its aggregation says. root: another than the variant's.
 
-    DataError for no videos, and for a single clip where a distribution is needed.
+    Raises DataError for no videos, and for a single clip where a distribution is needed.
     """
     if not pairs:
         raise DataError(f"{variant.metric} ({variant.name}): no videos to compare")

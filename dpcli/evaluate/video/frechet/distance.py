@@ -30,19 +30,19 @@ class FeatureStatistics:
 
     @property
     def samples(self) -> int:
-        """The number N of samples."""
+        """Returns the number N of samples."""
         return self.count + len(self.rows)
 
     @property
     def mean(self) -> np.ndarray:
-        """The mean, f64 (D). DataError without samples."""
+        """Returns the mean, f64 (D). Raises DataError without samples."""
         if not self.samples:
             raise DataError("no features: an empty set has no mean")
         return (self.rows.sum(0) + (0 if self.total is None else self.total)) / self.samples
 
     @property
     def covariance(self) -> np.ndarray:
-        """The covariance, f64 (D,D), denominator N - 1. DataError for fewer than two samples."""
+        """Returns the covariance, f64 (D,D), denominator N - 1. Raises DataError for fewer than two samples."""
         self._check_spread()
         factor = self._deviations(self.mean)
         summed = factor.T @ factor
@@ -61,7 +61,7 @@ class FeatureStatistics:
         return np.sqrt(values.clip(0))[:, None] * vectors.T
 
     def __add__(self, other: FeatureStatistics) -> FeatureStatistics:
-        """Returns the statistics of both sets together. DataError when they have different numbers of features."""
+        """Returns the statistics of both sets together. Raises DataError when they have different numbers of features."""
         if self.rows.shape[1] != other.rows.shape[1]:
             raise DataError(
                 f"features of {self.rows.shape[1]} and of {other.rows.shape[1]} values: two networks' can't be compared"
@@ -82,7 +82,7 @@ class FeatureStatistics:
 
 
 def feature_update(features: np.ndarray, before: FeatureStatistics | None = None) -> FeatureStatistics:
-    """Returns the statistics of features f (N,D) together with those before. DataError for NaN and infinite ones, ValueError for shapes."""
+    """Adds features f (N,D) to the statistics and returns them. Raises DataError for non-finite ones, ValueError for shapes."""
     rows = np.asarray(features, np.float64)
     if rows.ndim != 2:
         raise ValueError(f"features must have shape (N,D), but have {rows.shape}")
@@ -97,7 +97,7 @@ def feature_update(features: np.ndarray, before: FeatureStatistics | None = None
 
 
 def feature_merge(parts: Iterable[FeatureStatistics]) -> FeatureStatistics:
-    """Returns the statistics of all sets together. DataError when there is none."""
+    """Returns the statistics of all sets together. Raises DataError when there is none."""
     parts = list(parts)
     if not parts:
         raise DataError("no features to merge: no video had enough frames")
@@ -113,7 +113,7 @@ def frechet_distance(
     = B^T B: exact for any rank; scipy: scipy.linalg.sqrtm of the product, with `jitter` on both diagonals where that is
     not finite (StyleGAN-V, DisCo, pytorch-fid); svd: TF-GAN's symmetric square roots (VideoGPT).
     single: with fewer than two samples on a side, "error" (DataError) or "mean": the first term alone (common_metrics).
-    ValueError for another root.
+    Raises ValueError for another root.
 
     >>> left, right = (feature_update(np.array([[0.0], [2.0]]) + shift) for shift in (0, 3))
     >>> round(frechet_distance(left, right), 9)
@@ -141,7 +141,7 @@ def single_video_distance(predicted: np.ndarray, truth: np.ndarray) -> float:
     """Returns |f - g|^2 + (std f - std g)^2, std over a video's D features with denominator D - 1: one video against one.
 
     What Consistent4D's script gives with numpy < 2.2, whose `cov` reads one row of features as D observations of one
-    variable (numpy 2.2 and later give NaN). f, g (D). DataError for features that are not finite.
+    variable (numpy 2.2 and later give NaN). f, g (D). Raises DataError for features that are not finite.
 
     >>> single_video_distance(np.array([0.0, 2.0]), np.array([1.0, 3.0]))
     2.0

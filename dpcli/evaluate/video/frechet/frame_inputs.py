@@ -21,7 +21,7 @@ MEAN_R3D = (114.7748, 107.7354, 99.4750)  # of RGB in 0..255, Kinetics
 def prepare_frame(variant: FeatureVariant, picture: np.ndarray) -> torch.Tensor:
     """Returns a frame f32 (3,H,W), RGB in 0..1, as f32 (3,h,w) that the variant's network takes.
 
-    DataError for values that are not finite or far above 1, ValueError for another shape.
+    Raises DataError for values that are not finite or far above 1, ValueError for another shape.
     """
     check_picture_values(picture)
     return _PREPARE[variant.name](np.ascontiguousarray(picture, np.float32))

@@ -89,7 +89,7 @@ VARIANTS = {
 
 
 def feature_variant(name: str) -> FeatureVariant:
-    """Returns a variant by its name. UsageError for names there aren't."""
+    """Returns a variant by its name. Raises UsageError for names there aren't."""
     if name not in VARIANTS:
         raise UsageError(f"variant {name!r}: expected {', '.join(VARIANTS)}")
     return VARIANTS[name]

@@ -56,11 +56,11 @@ class LearnedMetric(ABC):
 
     @abstractmethod
     def end(self) -> None:
-        """Ends the view. DataError when it had too few frames."""
+        """Ends the view. Raises DataError when it had too few frames."""
 
     @abstractmethod
     def score(self) -> LearnedScore:
-        """Returns the metric over all views seen. DataError when there were too few."""
+        """Returns the metric over all views seen. Raises DataError when there were too few."""
 
 
 class FrameGap:

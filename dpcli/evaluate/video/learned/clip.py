@@ -77,7 +77,7 @@ class ClipTemporal(LearnedMetric):
         self._before = now
 
     def end(self) -> None:
-        """Ends the view. DataError when no two frames followed each other."""
+        """Ends the view. Raises DataError when no two frames followed each other."""
         if not self._found[self._view]:
             raise DataError(f"view {self._view!r}: no two frames in a row; clip_temporal compares consecutive ones")
 
@@ -123,7 +123,7 @@ class ClipViews(LearnedMetric):
         """Ends the view; which frames all views have is known at the end."""
 
     def score(self) -> LearnedScore:
-        """Returns the mean over pairs of views and frames. DataError for one view, or no frame that all have."""
+        """Returns the mean over pairs of views and frames. Raises DataError for one view, or no frame that all have."""
         if self._views < 2:
             raise DataError("clip_views compares views, and there is one; leave it out of --metrics")
         sums = [self._sums[frame] for frame, views in self._seen.items() if views == self._views]

@@ -34,11 +34,11 @@ class FrechetMetric(LearnedMetric):
         self._video.add(predicted, truth)
 
     def end(self) -> None:
-        """Ends the video. DataError when it had too few frames."""
+        """Ends the video. Raises DataError when it had too few frames."""
         self._pairs.append(self._video.result())
 
     def score(self) -> LearnedScore:
-        """Returns the distance over all videos. DataError where there were too few clips for a distribution."""
+        """Returns the distance over all videos. Raises DataError where there were too few clips for a distribution."""
         from dpcli.evaluate.video.frechet.clip_features import video_distance
         from dpcli.evaluate.video.frechet.variants import feature_choices
 

@@ -70,9 +70,9 @@ class WarpingError:
         self.flow_of = "prediction"
 
     def add(self, predicted: np.ndarray, truth: np.ndarray | None = None) -> None:
-        """Takes the next frame, f32 (3,H,W) in 0..1. DataError as `check_picture_values`, and for pictures under 16 pixels.
+        """Takes the next frame f32 (3,H,W), 0..1. Raises DataError as `check_picture_values`, and for pictures under 16 pixels.
 
-        ValueError for sizes that differ, and for a truth that comes and goes.
+        Raises ValueError for sizes that differ, and for a truth that comes and goes.
         """
         for picture in (predicted, truth):
             if picture is not None:
@@ -88,7 +88,7 @@ class WarpingError:
         self._before = None
 
     def result(self) -> WarpingStatistics:
-        """Returns the sums of all pairs. DataError when no two frames followed each other."""
+        """Returns the sums of all pairs. Raises DataError when no two frames followed each other."""
         if not self._found.pairs:
             raise DataError("temporal consistency compares neighboring frames: at least 2 in a row are needed")
         return self._found
@@ -157,7 +157,7 @@ class WarpingMetric(LearnedMetric):
         self._warping.add(predicted, truth)
 
     def end(self) -> None:
-        """Ends the view. DataError when no two frames followed each other."""
+        """Ends the view. Raises DataError when no two frames followed each other."""
         self._parts[self._view] = self._warping.result()
 
     def score(self) -> LearnedScore:

@@ -31,7 +31,7 @@ def _is_clip(path: Path) -> bool:
 
 
 def open_source(path: Path, *, truth: Source | None = None) -> Source:
-    """Returns the videos at `path`; `truth` gives a Gaussian scene its cameras and times. DataError for anything else."""
+    """Returns the videos at `path`; `truth` gives Gaussian scenes their cameras and times. Raises DataError for others."""
     if path.is_dir():
         return FolderSource(path)
     if not path.is_file():

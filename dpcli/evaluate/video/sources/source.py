@@ -21,7 +21,7 @@ class View:
 
     @property
     def title(self) -> str:
-        """The name that the view goes by first."""
+        """Returns the name that the view goes by first."""
         return self.names[0]
 
 
@@ -34,7 +34,7 @@ class Picture:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Returns width and height in pixels."""
         height, width = (self.rgba if self.values is None else self.values).shape[:2]
         return width, height
 

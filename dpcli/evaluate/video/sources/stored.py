@@ -43,7 +43,7 @@ class ViewsSource(Source):
 class SceneSource(Source):
     """Renders a `gaussians` file at the cameras and times of a views file, in float32, never rounded to 8 bits.
 
-    DataError when the truth's times lie more than half a frame outside the scene's.
+    Raises DataError when the truth's times lie more than half a frame outside the scene's.
     """
 
     kind, frames = "gaussians file", None

@@ -46,7 +46,7 @@ class Round:
     depth: Tensor
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travels between processes as arrays: of tensors torch would make a file in shared memory each."""
+        """Makes the round travel between processes as arrays: of tensors torch would make a file in shared memory each."""
         return _of_arrays, (self.rgba.numpy(), self.thickness.numpy(), self.depth.numpy())
 
     def take(self, rows: np.ndarray) -> Batch:
