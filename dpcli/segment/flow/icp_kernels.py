@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from dpcli.ops.cpu.jit import inlined, kernel
+from dpcli.ops.cpu.jit import kernel, piece_kernel
+from dpcli.ops.cpu.simd import WIDTH, lanes, load, store
 
 _BLOCK = 128  # distances whose least is found at once; the compiler vectorizes that for 128, not for 64
 _WORST = np.int32(0x7FFFFFFF)
@@ -52,7 +53,7 @@ def _look_up(points, search, work, bits, at, far):
     least M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
     """
     cloud, _, around, near, grid, origin, cells_per_unit = search
-    count, lanes, top = np.uintp(points.shape[1]), np.uintp(near.shape[2]), np.int32(0)
+    count, each, top, places = np.uintp(points.shape[1]), np.uintp(near.shape[2]), np.int32(0), near.reshape(-1)
     ends = np.int32(grid.shape[0] - 1), np.int32(grid.shape[1] - 1), np.int32(grid.shape[2] - 1)
     for n in range(count):
         i = min(max(np.int32((points[0, n] - origin[0]) * cells_per_unit), top), ends[0])
@@ -66,16 +67,21 @@ def _look_up(points, search, work, bits, at, far):
             grid[i, j, k] = start
         at[n] = start
     for n in range(count):
-        row = np.uintp(at[n])
-        for t in range(lanes):
-            a, b, c = near[row, 0, t] - points[0, n], near[row, 1, t] - points[1, n], near[row, 2, t] - points[2, n]
-            work[n * lanes + t] = a * a + b * b + c * c
+        row = np.uintp(3) * each * np.uintp(at[n])
+        x, y, z = lanes(points[0, n]), lanes(points[1, n]), lanes(points[2, n])
+        for t in range(np.uintp(0), each, np.uintp(WIDTH)):
+            a, b, c = (
+                load(places, row + t) - x,
+                load(places, row + each + t) - y,
+                load(places, row + each + each + t) - z,
+            )
+            store(work, n * each + t, a * a + b * b + c * c)
     for n in range(count):
         best = np.int64(0x7FFFFFFFFFFFFFFF)
         for t in range(np.uintp(around.shape[1])):
-            best = min(best, (np.int64(bits[n * lanes + t]) << 32) | np.int64(t))  # sorts as (distance, t)
+            best = min(best, (np.int64(bits[n * each + t]) << 32) | np.int64(t))  # sorts as (distance, t)
         t = np.uintp(best & 15)
-        far[n] = work[n * lanes + t]
+        far[n] = work[n * each + t]
         at[n] = around[np.uintp(at[n]), t]
 
 
@@ -118,18 +124,19 @@ def _compose(motion, v, center):
                 motion[i, 3] += center[i] + v[3 + i]
 
 
-@inlined
+@piece_kernel
 def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector):
     """Writes the lower triangle of a Gauss-Newton step's matrix (6,6) and its vector (6); returns the sum of weights.
 
-    The sums are plain numbers: kept in arrays, they were stored again for every point.
+    The sums are plain numbers: kept in arrays, they were stored again for every point. Their order is left to the compiler,
+    which then takes several points at a time.
     """
     total = 1e-6
     v0 = v1 = v2 = v3 = v4 = v5 = 0.0
     m00 = m10 = m11 = m20 = m21 = m22 = 0.0
     m30 = m31 = m32 = m40 = m41 = m42 = m50 = m51 = m52 = 0.0
     m33 = m43 = m44 = m53 = m54 = m55 = 0.0
-    for i in range(moved.shape[1]):
+    for i in range(np.uintp(moved.shape[1])):
         x, y, z, j = moved[0, i], moved[1, i], moved[2, i], np.uintp(at[i])
         w = 1 / (1 + far[i] / (scale * scale))
         w *= w
@@ -173,16 +180,16 @@ def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, 
     return total
 
 
-@kernel
+@piece_kernel
 def _move(source, motion, moved, rounded, center):
     """Moves source (3,n): into `moved` as f64, into `rounded` as f32; and computes the center (3)."""
     for k in range(3):
-        total = 0.0
-        for i in range(source.shape[1]):
-            s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
-            moved[k, i] = s + motion[k, 3]
-            rounded[k, i] = moved[k, i]
-            total += moved[k, i]
+        total, row, short = 0.0, moved[k], rounded[k]
+        for i in range(np.uintp(source.shape[1])):
+            s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i] + motion[k, 3]
+            row[i] = s
+            short[i] = s
+            total += s
         center[k] = total / source.shape[1]
 
 
@@ -249,6 +256,16 @@ def residual_kernel(source, search, motion, share, out, at):
         x, y, z, j = moved[0, i], moved[1, i], moved[2, i], np.uintp(at[i])
         gap = (cloud[0, j] - x) * normals[0, j] + (cloud[1, j] - y) * normals[1, j] + (cloud[2, j] - z) * normals[2, j]
         out[i] = share * far[i] + (1 - share) * gap * gap
+
+
+@kernel
+def explain_kernel(source, search, motion, share, scale, first, cost, nearest):
+    """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residual_kernel`; nearest i32 (n) gets first + the nearest's index."""
+    squared, at = np.empty(source.shape[1]), np.empty(source.shape[1], np.int64)
+    residual_kernel(source, search, motion, share, squared, at)
+    for i in range(len(squared)):
+        cost[i] += squared[i] / (squared[i] + scale * scale)
+        nearest[i] = first + at[i]
 
 
 @kernel

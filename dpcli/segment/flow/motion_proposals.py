@@ -9,6 +9,10 @@ from dpcli.segment.flow.icp_kernels import distinct_kernel, lloyd_kernel
 
 ANGLES = (-0.6, -0.3, 0.3, 0.6)  # radians
 SHIFTS = (-0.18, -0.08, 0.08, 0.18)  # diameters
+SPINS = (-0.4, 0.4)  # radians
+_HINGES, _ACROSS = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])  # axes of the edges turned about, and where they lie
+_TURNED = np.array([*np.tile(np.repeat(_HINGES, len(ANGLES)), 2), 2, 2])  # the axis of each turn and spin
+_ANGLES = np.array([*ANGLES * 8, *SPINS])
 
 
 def turn_about(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
@@ -21,10 +25,8 @@ def turn_about(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     sine, versine = np.sin(angles)[:, None, None], 1 - np.cos(angles)[:, None, None]
     rotation = np.eye(3) + sine * cross + versine * cross @ cross
-    offset = np.broadcast_to(centers, axes.shape) - np.einsum(
-        "hij,hj->hi", rotation, np.broadcast_to(centers, axes.shape)
-    )
-    return np.concatenate([rotation, offset[:, :, None]], 2)
+    centers = np.broadcast_to(centers, axes.shape)[:, :, None]
+    return np.concatenate([rotation, centers - rotation @ centers], 2)
 
 
 def shift_by(offsets: np.ndarray) -> np.ndarray:
@@ -45,19 +47,14 @@ def propose_motions(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
     it onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
     """
     center = points.mean(0)
-    axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]  # longest first, the normal last
-    extent = np.abs((points - center) @ axes.T).max(0)
-    hinge, across = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])
-    edges = center + np.array([-1, 1])[:, None, None] * (extent[across, None] * axes[across])  # [side, hinge, 3]
-    angles = len(ANGLES)
-    turns = turn_about(
-        np.tile(np.repeat(axes[hinge], angles, 0), (2, 1)),
-        np.tile(ANGLES, 8),
-        np.repeat(edges.reshape(-1, 3), angles, 0),
-    )
-    spins = turn_about(axes[[2, 2]], np.array([-0.4, 0.4]), center)
-    offsets = np.concatenate([np.zeros((1, 3)), *(axes * by for by in SHIFTS), lonely - center])
-    return np.concatenate([turns, spins, shift_by(offsets)])
+    apart = points - center
+    axes = np.linalg.eigh(apart.T @ apart)[1].T[::-1]  # longest first, the normal last
+    extent = np.abs(apart @ axes.T).max(0)
+    edge = extent[_ACROSS, None] * axes[_ACROSS]
+    sides = np.repeat(np.concatenate([-edge, edge]), len(ANGLES), 0)
+    offsets = [np.zeros((1, 3)), (np.array(SHIFTS)[:, None, None] * axes).reshape(-1, 3), lonely - center]
+    turns = turn_about(axes[_TURNED], _ANGLES, center + np.concatenate([sides, np.zeros((len(SPINS), 3))]))
+    return np.concatenate([turns, shift_by(np.concatenate(offsets))])
 
 
 def choose_distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:

@@ -59,7 +59,12 @@ def find_bodies(source: np.ndarray, target: np.ndarray, search: BodySearch | Non
 
     The clouds have a diameter of about 1, and 9 points or more.
     """
-    return _BodyFinder(Surface(source), Surface(target), search or BodySearch()).run()
+    return find_surface_bodies(Surface(source), Surface(target), search or BodySearch())
+
+
+def find_surface_bodies(source: Surface, target: Surface, search: BodySearch) -> Bodies:
+    """Returns what `find_bodies` does, of clouds that are prepared: whoever compares one with many prepares it once."""
+    return _BodyFinder(source, target, search).run()
 
 
 class _BodyFinder:

@@ -6,6 +6,7 @@ import numpy as np
 
 from dpcli.segment.flow.icp_kernels import (
     cover_kernel,
+    explain_kernel,
     hypotheses_kernel,
     icp_kernel,
     linearize_kernel,
@@ -99,13 +100,25 @@ class Surface:
 
     def residuals(self, source: np.ndarray, motion: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""
-        return self.match(source, motion, share)[0]
-
-    def match(self, source: np.ndarray, motion: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the squared residuals (n) of `residuals` and the nearest point's index i64 (n) of each."""
         out, at = np.empty(source.shape[1]), np.empty(source.shape[1], np.int64)
         residual_kernel(source, self._search, motion, share, out, at)
-        return out, at
+        return out
+
+    def explain(
+        self,
+        source: np.ndarray,
+        motion: np.ndarray,
+        share: float,
+        scale: float,
+        first: int,
+        cost: np.ndarray,
+        nearest: np.ndarray,
+    ) -> None:
+        """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residuals`, and writes `first` plus each nearest point's index.
+
+        The indices go into nearest i32 (n).
+        """
+        explain_kernel(source, self._search, motion, share, scale, first, cost, nearest)
 
     def covered_by(self, moved: np.ndarray, normals: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (N) of this cloud's points to another one, moved (n,3), with its normals (n,3)."""

@@ -11,27 +11,33 @@ from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_ker
 from dpcli.segment.multibody.settings import MultibodySettings
 
 _TEMPERATURES = np.geomspace(0.2, 0.03, 10)
+# Of the cost of borders, when bodies are judged. Labels need all of it against noise; but a border is the same in all frames,
+# and where motion tells both sides apart it costs little to say: in full, thin parts cost more than their motion saves.
+_JUDGED = 0.6
 
 
 @dataclass
 class Body:
-    """Holds a trajectory with the costs (N) and nearest points (N,P) of all points under it (`Frames.explain`)."""
+    """Holds a trajectory with the costs (N) and nearest points (N,P) of all points under it (`Frames.explain`).
+
+    motions (F,P,3,4): from every frame to its partners.
+    """
 
     trajectory: Trajectory
+    motions: np.ndarray
     cost: np.ndarray
     nearest: np.ndarray
 
 
 @dataclass
 class Explanation:
-    """Holds bodies, the largest first, labels i64 (N), soft shares f32 (N,K) and the energy, a cost per point.
+    """Holds bodies, the largest first, labels i64 (N) and the energy, a cost per point.
 
     cost, field: f32 (N,K), of the points under every body with the price of displacement, and less what others support.
     """
 
     bodies: list[Body]
     label: np.ndarray
-    share: np.ndarray
     energy: float
     cost: np.ndarray
     field: np.ndarray
@@ -39,7 +45,7 @@ class Explanation:
 
 def body_of(frames: Frames, trajectory: Trajectory) -> Body:
     """Returns the body that moves along a trajectory."""
-    return Body(trajectory, *frames.explain(trajectory))
+    return Body(trajectory, frames.motions(trajectory), *frames.explain(trajectory))
 
 
 def label_points(
@@ -47,30 +53,27 @@ def label_points(
 ) -> Explanation:
     """Returns the explanation by these bodies; start: labels (N) to begin at, none: the least cost of each point.
 
-    Labels come from mean field, from hot to cold.
+    Labels come from mean field, from hot to cold. In the energy, borders count less than in the labels.
     """
-    cost = costs_of(frames, bodies, settings)
+    alike, away = frames.compare(np.stack([body.motions for body in bodies]), settings.hinge)
+    cost = np.stack([body.cost for body in bodies], 1) + np.float32(settings.displacement) * away
     nearest = np.stack([body.nearest for body in bodies])
-    alike = frames.compare([body.trajectory for body in bodies], settings.hinge)
-    around = 0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)
-    first = around.argmin(1) if start is None else start
-    share = np.eye(len(bodies), dtype=np.float32)[first] * 0.8 + np.float32(0.2 / len(bodies))
+    if start is None:
+        start = (0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)).argmin(1)
+    share = np.full((len(cost), alike.shape[2]), np.float32(0.2 / len(bodies)))
+    share[np.arange(len(cost)), start] += np.float32(0.8)
     weights = (settings.border, settings.agreement)
     mean_field_kernel(cost, frames.neighbors, nearest, alike, *weights, _TEMPERATURES, share)
-    label, support = share.argmax(1), np.empty((2, *share.shape), np.float32)
-    hard = np.eye(len(bodies), dtype=np.float32)[label]
+    label = share[:, : len(bodies)].argmax(1)
+    hard, support = np.zeros_like(share), np.empty((2, *cost.shape), np.float32)
+    hard[np.arange(len(label)), label] = 1
     support_kernel(hard, frames.neighbors, nearest, alike, support)
     field = cost - settings.border * support[0] - settings.agreement * support[1]
-    own = field[np.arange(len(label)), label].mean(dtype=np.float64) + sum(weights)
-    return Explanation(bodies, label, share, float(own) + settings.body_price * len(bodies), cost, field)
-
-
-def costs_of(frames: Frames, bodies: list[Body], settings: MultibodySettings) -> np.ndarray:
-    """Returns the costs f32 (N,K) of all points under every body, with the price of displacement from the first."""
-    main = bodies[0].trajectory
-    far = [frames.displace(body.trajectory, main) for body in bodies[1:]]
-    away = np.stack([np.zeros(len(frames.points), np.float32), *far], 1)
-    return np.ascontiguousarray(np.stack([body.cost for body in bodies], 1) + settings.displacement * away, np.float32)
+    own = np.arange(len(label)), label
+    explained = cost[own].mean(dtype=np.float64)
+    borders = field[own].mean(dtype=np.float64) - explained + sum(weights)
+    energy = explained + _JUDGED * borders + settings.body_price * len(bodies)
+    return Explanation(bodies, label, float(energy), cost, field)
 
 
 def without_empty(frames: Frames, found: Explanation, settings: MultibodySettings) -> Explanation:

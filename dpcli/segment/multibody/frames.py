@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.segment.flow.surface_icp import Surface, columns
-from dpcli.segment.multibody.label_kernels import alike_kernel
+from dpcli.segment.multibody.label_kernels import alike_kernel, displacement_kernel, gain_kernel, row_length
 
 _PARTNERS = 6  # other frames that a point is compared with, so that the cost stays linear in frames
 POINT_SHARE = 0.15  # of point-to-point distance in a residual, besides point to plane
 _OF_SPACING = 0.6  # residual that counts one half, in spacings of the points
 _ONE_PLACE = 0.85  # spacings: how far apart two motions may take a point for it to be at their hinge
+_LEAST_GAIN = 0.02  # of a point: less than this is chance
 _FEWEST = 6  # points of a frame that can hold a motion
 
 Trajectory = np.ndarray  # (F,3,4): takes a body from its own coordinates to every frame
@@ -29,6 +30,7 @@ class Frames:
         self.points = np.concatenate([surface.points for surface in self.surfaces]).astype(np.float64)
         self.neighbors = np.concatenate([s.neighbors + start for s, start in zip(self.surfaces, self.starts)])
         self.partners = [choose_partners(t, len(clouds)) for t in range(len(clouds))]
+        self._partners, self._columns = np.array(self.partners), np.ascontiguousarray(self.points.T)
         self.spacing = max(float(np.median([surface.spacing for surface in self.surfaces])), 1e-4)
         self.scales = [_OF_SPACING * max(surface.spacing, self.spacing) for surface in self.surfaces]
 
@@ -39,6 +41,12 @@ class Frames:
         """Returns where the points of frame t lie among all N."""
         return slice(int(self.starts[t]), int(self.starts[t + 1]))
 
+    def motions(self, trajectory: Trajectory) -> np.ndarray:
+        """Returns the motions (F,P,3,4) of a trajectory from every frame to its partners."""
+        first, second = trajectory[:, None], trajectory[self._partners]
+        turn = second[..., :3] @ first[..., :3].swapaxes(-1, -2)
+        return np.concatenate([turn, second[..., 3:] - turn @ first[..., 3:]], -1)
+
     def explain(self, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
         """Returns costs f32 (N), 0..1, of all points under one trajectory, and the nearest points i32 (N,partners).
 
@@ -46,35 +54,33 @@ class Frames:
         """
         cost = np.zeros(len(self.points), np.float32)
         nearest = np.zeros((len(self.points), len(self.partners[0])), np.int32)
-        for t, others in enumerate(self.partners):
+        for t, (others, motions) in enumerate(zip(self.partners, self.motions(trajectory))):
             own = self.slice(t)
-            for column, u in enumerate(others):
-                motion = relative_motion(trajectory, t, u)
-                squared, at = self.surfaces[u].match(self.surfaces[t].columns, motion, POINT_SHARE)
+            for column, (u, motion) in enumerate(zip(others, motions)):
                 scale = max(self.scales[t], self.scales[u])
-                cost[own] += squared / (squared + scale**2)
-                nearest[own, column] = at + self.starts[u]
+                out = cost[own], nearest[own, column]
+                self.surfaces[u].explain(self.surfaces[t].columns, motion, POINT_SHARE, scale, self.starts[u], *out)
             cost[own] /= len(others)
         return cost, nearest
 
-    def displace(self, trajectory: Trajectory, reference: Trajectory) -> np.ndarray:
-        """Returns how far (N), on average over partner frames, two trajectories take every point from each other."""
-        gap = np.zeros(len(self.points), np.float32)
-        for t, others in enumerate(self.partners):
-            own = self.slice(t)
-            for u in others:
-                apart = relative_motion(trajectory, t, u) - relative_motion(reference, t, u)
-                gap[own] += np.linalg.norm(move(apart, self.points[own]), axis=1)
-            gap[own] /= len(others)
-        return gap
+    def gain(self, current: np.ndarray, cost: np.ndarray, motions: np.ndarray, main: np.ndarray, price: float) -> float:
+        """Returns what connected points would save, on average, by a body (costs (N), motions (F,P,3,4)) over what they cost now.
 
-    def compare(self, trajectories: list[Trajectory], hinge: float) -> np.ndarray:
-        """Returns how nearly two of K trajectories take every point to one place, f32 (N,K,K), see `alike_kernel`."""
-        alike = np.empty((len(self.points), len(trajectories), len(trajectories)), np.float32)
-        for t, others in enumerate(self.partners):
-            motions = np.stack([[relative_motion(one, t, u) for one in trajectories] for u in others])
-            alike_kernel(self.points[self.slice(t)], motions, _ONE_PLACE * self.spacing, hinge, alike[self.slice(t)])
-        return alike
+        price: of a point's distance from where the motions `main` would take it.
+        """
+        away = np.empty(len(self.points), np.float32)
+        displacement_kernel(self._columns, self.starts, motions, main, away)
+        return gain_kernel(current, cost, away, price, self.neighbors, _LEAST_GAIN)
+
+    def compare(self, motions: np.ndarray, hinge: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns how nearly two of K bodies (motions (K,F,P,3,4)) take every point to one place, f32 (N,K,row), see `alike_kernel`.
+
+        And how far, on average over partner frames, each body and the first take every point from each other, f32 (N,K).
+        """
+        count, bodies = len(self.points), len(motions)
+        alike, away = np.zeros((count, bodies, row_length(bodies)), np.float32), np.empty((count, bodies), np.float32)
+        alike_kernel(self._columns, self.starts, motions, _ONE_PLACE * self.spacing, hinge, alike, away)
+        return alike, away
 
     def fit(self, trajectory: Trajectory, inside: np.ndarray, own: bool, tight: float) -> Trajectory:
         """Returns a body's trajectory, frame after frame brought by ICP to where its points (mask (N)) of others agree.
@@ -83,14 +89,15 @@ class Frames:
         """
         trajectory = trajectory.copy()
         points = [self.points[self.slice(t)][inside[self.slice(t)]] for t in range(len(self))]
+        at_rest = [bring_to_rest(cloud, motion) for cloud, motion in zip(points, trajectory)]
         for u in range(len(self)):
-            others = [move(relative_motion(trajectory, t, u), points[t]) for t in self.partners[u]]
-            source = np.concatenate(others)
+            source = move(trajectory[u], np.concatenate([at_rest[t] for t in self.partners[u]]))
             if len(source) < _FEWEST or (own and len(points[u]) < 3 * _FEWEST):
                 continue
             target = Surface(points[u]) if own else self.surfaces[u]
             step = target.icp(columns(source), np.eye(3, 4), 6, 2 * tight * self.spacing, tight * self.spacing)
             trajectory[u] = compose(step, trajectory[u])
+            at_rest[u] = bring_to_rest(points[u], trajectory[u])
         return trajectory
 
 
@@ -116,6 +123,11 @@ def compose(after: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Returns the motion (3,4) that makes `before` and then `after`."""
     shift = after[:, :3] @ before[:, 3] + after[:, 3]
     return np.concatenate([after[:, :3] @ before[:, :3], shift[:, None]], 1)
+
+
+def bring_to_rest(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Returns points (n,3) in a body's own coordinates, from which a motion (3,4) takes them to where they are."""
+    return (points - motion[:, 3]) @ motion[:, :3]
 
 
 def move(motion: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.segment.flow.rigid_bodies import BodySearch, find_bodies
+from dpcli.segment.flow.rigid_bodies import BodySearch, find_surface_bodies
 from dpcli.segment.flow.surface_icp import columns
 from dpcli.segment.multibody.frames import POINT_SHARE, Frames, Trajectory, compose, move, relative_motion
 
@@ -32,10 +32,9 @@ class Hypothesis:
 
 def find_hypotheses(frames: Frames) -> list[Hypothesis]:
     """Returns different bodies that pairs of frames show, the largest first."""
-    pairs = _pairs(len(frames))
-    clouds = [surface.points for surface in frames.surfaces]
+    pairs, surfaces = _pairs(len(frames)), frames.surfaces
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda pair: find_bodies(clouds[pair[0]], clouds[pair[1]], _SEARCH), pairs))
+        found = list(pool.map(lambda pair: find_surface_bodies(surfaces[pair[0]], surfaces[pair[1]], _SEARCH), pairs))
         motions = {pair: bodies.motion for pair, bodies in zip(pairs, found)}
         seeds = [
             (pair, k, np.flatnonzero(bodies.label == k))
@@ -44,7 +43,7 @@ def find_hypotheses(frames: Frames) -> list[Hypothesis]:
         ]
         seeds = sorted((seed for seed in seeds if len(seed[2]) >= _FEWEST), key=lambda seed: -len(seed[2]))
         seeds = _spread(seeds, len(frames))
-        carried = pool.map(lambda seed: carry(frames, seed[0][0], clouds[seed[0][0]][seed[2]], motions), seeds)
+        carried = pool.map(lambda seed: carry(frames, seed[0][0], surfaces[seed[0][0]].points[seed[2]], motions), seeds)
         return keep_different(frames, list(carried))
 
 

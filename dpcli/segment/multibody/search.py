@@ -93,11 +93,8 @@ class Search:
     def _most_promising(self, found: Explanation) -> list[int]:
         """Returns the hypotheses by which connected points would save most, the best first."""
         current = found.cost[np.arange(len(found.label)), found.label]
-        main, saved = found.bodies[0].trajectory, []
-        for body in self.pool:
-            away = self.settings.displacement * self.frames.displace(body.trajectory, main)
-            less = current - body.cost - away
-            saved.append(np.maximum(0.5 * less + 0.5 * less[self.frames.neighbors].mean(1) - 0.02, 0).mean())
+        main, price = found.bodies[0].motions, self.settings.displacement
+        saved = [self.frames.gain(current, body.cost, body.motions, main, price) for body in self.pool]
         order = np.argsort(np.negative(saved), kind="stable")[:_TRIED]
         return [int(h) for h in order if saved[h] > 0]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from dpcli.segment.flow.motion_proposals import cluster_patches
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
-from dpcli.segment.multibody.frames import Frames, Trajectory
+from dpcli.segment.multibody.frames import Frames, Trajectory, bring_to_rest
 
 _PATCHES = (2, 4)  # that a body is divided into
 _FEWEST = 12  # points of a patch in a frame, on average
@@ -43,8 +43,7 @@ def _patches_of(frames: Frames, found: Explanation, k: int) -> list[tuple[np.nda
 
 def _at_rest(frames: Frames, trajectory: Trajectory) -> np.ndarray:
     """Returns all points (N,3) in the coordinates of a body, so that patches hold the same surface in all frames."""
-    points = [(frames.points[frames.slice(t)] - trajectory[t, :, 3]) @ trajectory[t, :, :3] for t in range(len(frames))]
-    return np.concatenate(points)
+    return np.concatenate([bring_to_rest(frames.points[frames.slice(t)], trajectory[t]) for t in range(len(frames))])
 
 
 def _fit_patch(frames: Frames, inside: np.ndarray, starts: list[Trajectory]) -> Body:
