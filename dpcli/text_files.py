@@ -91,7 +91,7 @@ def check_depth(value: Any, where: object) -> None:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Returns the content of a TOML file; DataError when it is none, or not there. Before Python 3.11 the reader is a package
+    """Returns the content of a TOML file; raises DataError if it is none or not there. Before Python 3.11 the reader is a package
     of its own.
     """
     if sys.version_info >= (3, 11):

@@ -274,7 +274,7 @@ def _folded(name: str) -> str:
 
 
 def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:
-    """Returns the largest label, which makes as many class names; DataError when no table of that many lines could mean it."""
+    """Returns the largest label, which makes as many class names. Raises DataError when so few lines can't mean it."""
     longest = max(
         records.values(), key=lambda record: (len(record["label"].lstrip("-0")), record["label"].lstrip("-0"))
     )

@@ -130,7 +130,7 @@ class RunFolder:
         os.close(self._lock)
 
     def _continues(self) -> bool:
-        """Returns whether an earlier run of this configuration is there, to go on with; UsageError when it is anything else."""
+        """Returns whether an earlier run of this configuration is there, to go on with. Raises UsageError for anything else."""
         saved = self.path / "config.json"
         if self.force:
             return False

@@ -214,7 +214,7 @@ class PartsReader(CloudsReader):
         return [self.read(index), said.probability, said.pairs, said.motion, said.flow]
 
     def read_parts(self, index: int) -> PartsSample:
-        """Reads what is said of sequence `index`; DataError when its values don't fit the sequence."""
+        """Reads what is said of sequence `index`; raises DataError when its values don't fit the sequence."""
         with reading(self.path):
             return self._read_parts(index)
 

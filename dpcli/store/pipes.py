@@ -70,7 +70,7 @@ def _spool() -> Iterator[Path]:
 
 
 def standard_input() -> BinaryIO:
-    """Returns stdin; UsageError when it is closed."""
+    """Returns stdin; raises UsageError when it is closed."""
     if sys.stdin is None:
         raise UsageError("-: standard input is closed; pipe a command into this one or name a file")
     return sys.stdin.buffer

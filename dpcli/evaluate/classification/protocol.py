@@ -112,7 +112,7 @@ def _metric(scores: np.ndarray, labels: np.ndarray) -> WeightedMetric:
 
 
 def _choose_samples(scores: ScoresReader, found: TruthLabels, split: str) -> tuple[np.ndarray, list[LeftOut]]:
-    """Returns which samples count, bool (S), and which don't and why. DataError when none does."""
+    """Returns which samples count, bool (S), and which don't and why. Raises DataError when none does."""
     of_split = found.in_truth & np.array([split in ("all", own) for own in found.splits], bool)
     if not of_split.any():
         known = ", ".join(sorted({own or '""' for own in found.splits})) or "no samples"

@@ -33,7 +33,7 @@ def write_page(
     fps: float | None = None,
     clip: Path | None = None,
 ) -> int:
-    """Writes the page and returns its size in bytes; DataError when it can't be written. fps: frames of the clip per second,
+    """Writes the page and returns its size in bytes. Raises DataError if it can't be written. fps: frames of the clip per second,
     None = as videos play it (`clip_rate`). clip: the views file whose pictures the page shows beside the scene.
 
     Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colors, opacities and weights

@@ -40,7 +40,7 @@ class Clip:
 
 
 def clip_names(file: Gltf) -> list[str]:
-    """Names of the animations in the file's order, each once: clip N when unnamed, NAME (2) for a second of a name.
+    """Returns the names of the animations in the file's order, each once: clip N when unnamed, NAME (2) for a second of a name.
 
     What would move a terminal's cursor is spelled out, such as \\x1b.
     """

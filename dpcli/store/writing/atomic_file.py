@@ -93,7 +93,7 @@ class AtomicFile:
             self._written_out = size
 
     def commit(self, kept: str = "") -> None:
-        """Closes the file, brings it to the disk and renames it; DpcError when that fails.
+        """Closes the file, brings it to the disk and renames it; raises DpcError when that fails.
 
         kept: as `problem`; with it the unfinished file stays when there was no room.
         """

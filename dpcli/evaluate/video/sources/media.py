@@ -82,7 +82,7 @@ def _view_of_folder(name: str) -> View:
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, bool]:
-    """Returns rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit color."""
+    """Returns rgba u8 (H,W,4), and whether the file has alpha. Raises DataError if unreadable or not 8-bit color."""
     try:
         with open_image(path) as image:
             require_one_picture(path, image)
