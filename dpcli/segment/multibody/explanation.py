@@ -11,9 +11,6 @@ from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_ker
 from dpcli.segment.multibody.settings import MultibodySettings
 
 _TEMPERATURES = np.geomspace(0.2, 0.03, 10)
-# Of the cost of borders, when bodies are judged. Labels need all of it against noise; but a border is the same in all frames,
-# and where motion tells both sides apart it costs little to say: in full, thin parts cost more than their motion saves.
-_JUDGED = 0.6
 
 
 @dataclass
@@ -53,7 +50,7 @@ def label_points(
 ) -> Explanation:
     """Returns the explanation by these bodies; start: labels (N) to begin at, none: the least cost of each point.
 
-    Labels come from mean field, from hot to cold. In the energy, borders count less than in the labels.
+    Labels come from mean field, from hot to cold.
     """
     alike, away = frames.compare(np.stack([body.motions for body in bodies]), settings.hinge)
     cost = np.stack([body.cost for body in bodies], 1) + np.float32(settings.displacement) * away
@@ -69,11 +66,8 @@ def label_points(
     hard[np.arange(len(label)), label] = 1
     support_kernel(hard, frames.neighbors, nearest, alike, support)
     field = cost - settings.border * support[0] - settings.agreement * support[1]
-    own = np.arange(len(label)), label
-    explained = cost[own].mean(dtype=np.float64)
-    borders = field[own].mean(dtype=np.float64) - explained + sum(weights)
-    energy = explained + _JUDGED * borders + settings.body_price * len(bodies)
-    return Explanation(bodies, label, float(energy), cost, field)
+    own = field[np.arange(len(label)), label].mean(dtype=np.float64) + sum(weights)
+    return Explanation(bodies, label, float(own) + settings.body_price * len(bodies), cost, field)
 
 
 def without_empty(frames: Frames, found: Explanation, settings: MultibodySettings) -> Explanation:

@@ -220,21 +220,6 @@ def test_most_bodies_is_kept_and_the_same_input_gives_the_same_answer():
     assert first.energy == second.energy and (first.label == second.label).all() and first.energy < one.energy
 
 
-def test_bodies_are_judged_by_less_of_the_borders_than_labels_are():
-    sequence = chest(points=200)
-    frames = Frames(np.split(sequence.points, sequence.frame_offsets[1:-1]))
-    bodies = [body_of(frames, np.ascontiguousarray(sequence.pose[:, k, :3], np.float64)) for k in (0, 1)]
-    found = label_points(frames, bodies, MultibodySettings(), sequence.part)
-    assert (found.label == sequence.part).mean() > 0.9
-    own = np.arange(len(found.label)), found.label
-    borders = found.field[own].mean() - found.cost[own].mean() + 0.3 + 0.3  # what no neighbor supports
-    assert (
-        found.energy == pytest.approx(found.cost[own].mean() + 0.6 * borders + 2 * 0.003, rel=1e-4) and borders > 0.01
-    )
-    free = label_points(frames, bodies, MultibodySettings(border=0, agreement=0), sequence.part)
-    assert (free.label == sequence.part).mean() < (found.label == sequence.part).mean()  # labels do need them
-
-
 def test_the_true_motion_explains_a_point_and_a_wrong_one_does_not():
     sequence = chest()
     frames = Frames([sequence.frame(t) for t in range(4)])
