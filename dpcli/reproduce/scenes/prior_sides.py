@@ -1,6 +1,6 @@
 """The sides that a shape prior shows, without any fit, of models of body plans that it never learned from.
 
-    python -m dpcli.reproduce.scenes.prior_sides MESHES OUT [--models network,folder,...] [--clips animals_pack/Fox.glb:Walk,...]
+    python -m dpcli.reproduce.scenes.prior_sides MESHES OUT [--models creatures,FOLDER,...] [--clips animals_pack/Fox.glb:Walk,...]
 
 MESHES: the folder of models. One view of a clip, in profile, obliquely and from the front, becomes layers by each prior; the columns
 between fronts and backs are drawn from four azimuths that no prior saw: PSNR on white and IoU of the silhouettes. The
