@@ -112,6 +112,7 @@ def test_gaussians_that_supersplat_packed(tmp_path, tinted, order):
         ),
         ("a.spz", spz(*scene(40, 0), 2)[:-60], "truncated|not a readable"),
     ],
+    ids=["odd length", "not finite", "unpacked", "no head", "version", "count", "short", "cut"],  # gzip holds the time
 )
 def test_damaged_gaussians_are_named(tmp_path, name, data, told):
     (tmp_path / name).write_bytes(data)
