@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.depth import calm_depth
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.scene.seen_gaussians import trust
@@ -14,7 +13,7 @@ from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
 from dpcli.ops.rigid_parts import find_parts
 from dpcli.ops.rotations import normalize_quaternion
-from dpcli.store.gaussians import GaussianScene
+from dpcli.store.gaussians import SH_C0, GaussianScene
 
 _SOLID = 0.1  # opacity of a Gaussian whose motion counts; fainter ones float anywhere
 
@@ -42,7 +41,7 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict, *, calm: bool = Fa
         log_scale=_array(gaussians.log_scale),
         quaternion=_array(normalize_quaternion(gaussians.quaternion)),
         opacity_logit=_array(gaussians.opacity_logit),
-        sh=_array((gaussians.color[:, None] - 0.5) / SH0),
+        sh=_array((gaussians.color[:, None] - 0.5) / SH_C0),
         time=targets.seconds,
         frame_mean=_array(frame_mean),
         frame_quaternion=_array(normalize_quaternion(motion["quaternion"])),

@@ -9,7 +9,6 @@ from dpcli.generate4d.config import FitConfig
 from dpcli.generate4d.scene.control_points import mean_neighbor_distance
 from dpcli.ops.rotations import normalize_quaternion, rotate_by_quaternion
 
-SH0 = 0.28209479177387814  # value of the constant spherical harmonic
 _SPLIT = 0.47  # log 1.6: how much smaller the halves of a split Gaussian are (Kerbl et al. 2023)
 NAMES = ("mean", "log_scale", "quaternion", "opacity_logit", "color")
 

@@ -10,11 +10,12 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
+from dpcli.store.gaussians import color_of
 
 _TINY = 1e-36  # below it and above its inverse lie no numbers but those whose bytes mean something else
 AT_ORIGIN = "points at (0,0,0) dropped"
 _WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
-_HARMONICS, _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2"), 0.28209479177387814  # of Gaussians: color seen from all sides
+_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussians: color seen from all sides
 MOST_UNNAMED = 40  # columns; a picture has more
 BEYOND = "points beyond the number that their file's header says dropped"
 
@@ -149,8 +150,8 @@ def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
 
 
 def color_of_harmonics(first: np.ndarray) -> np.ndarray:
-    """Returns colors u8 (N,3) of Gaussians from their spherical harmonics of degree 0 (N,3), as 3DGS has them."""
-    return np.rint(255 * np.clip(np.nan_to_num(0.5 + _SH0 * first.astype(np.float64)), 0, 1)).astype(np.uint8)
+    """Returns colors u8 (N,3) of Gaussians from their spherical harmonics of degree 0 (N,3), black where these are no numbers."""
+    return color_of(np.where(np.isnan(first), -np.inf, first.astype(np.float64))[:, None])
 
 
 def unpack_rgb(packed: np.ndarray) -> np.ndarray | None:

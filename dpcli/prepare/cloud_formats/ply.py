@@ -50,7 +50,10 @@ class Element:
 
 
 def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
-    """Reads the vertices, or the Gaussians that SuperSplat packed. Raises DataError when they end early, or hold what their types can't."""
+    """Reads the vertices, or the Gaussians that SuperSplat packed.
+
+    Raises DataError when they end early, or hold what their types can't.
+    """
     with path.open("rb") as file:
         order, elements = read_header(path, file)
         unit = _unit(file)

@@ -24,9 +24,7 @@ _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 _PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
 _PIXELS |= {"mono8": "u1", "z16": "u2"}
 _JPEG = b"\xff\xd8\xff"
-_DEPTH_HEADER = struct.Struct(
-    "<iff"
-)  # before what packs the depth, of image_transport's compressedDepth: format, and two numbers
+_DEPTH_HEADER = struct.Struct("<iff")  # of image_transport's compressedDepth, before the depth: format, two numbers
 
 
 def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cloud:
@@ -59,9 +57,8 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
     columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
     cloud = cloud_of_columns(path, columns, keep)
-    cloud.unread += tuple(
-        field.name for field in content.fields if field.name not in fields
-    )  # of several numbers a point
+    several = (field.name for field in content.fields if field.name not in fields)  # numbers a point
+    cloud.unread += tuple(several)
     return cloud
 
 

@@ -127,7 +127,7 @@ def named_up(path: Path) -> np.ndarray | None:
             continue
         try:
             up = np.array(told, np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             up = np.zeros(0)
         length = float(np.linalg.norm(up))
         if up.shape != (3,) or not 1e-9 < length < np.inf:

@@ -260,7 +260,7 @@ def residual_kernel(source, search, motion, share, out, at):
 
 @kernel
 def explain_kernel(source, search, motion, share, scale, first, cost, nearest):
-    """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residual_kernel`; nearest i32 (n) gets first + the nearest's index."""
+    """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residual_kernel`; nearest i32 (n): first + its index."""
     squared, at = np.empty(source.shape[1]), np.empty(source.shape[1], np.int64)
     residual_kernel(source, search, motion, share, squared, at)
     for i in range(len(squared)):

@@ -114,9 +114,9 @@ class Surface:
         cost: np.ndarray,
         nearest: np.ndarray,
     ) -> None:
-        """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residuals`, and writes `first` plus each nearest point's index.
+        """Adds d^2 / (d^2 + scale^2) to cost f32 (n), d^2 as in `residuals`.
 
-        The indices go into nearest i32 (n).
+        nearest i32 (n) gets `first` plus each nearest point's index.
         """
         explain_kernel(source, self._search, motion, share, scale, first, cost, nearest)
 

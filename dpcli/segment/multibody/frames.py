@@ -29,8 +29,8 @@ class Frames:
         self.starts = np.concatenate([[0], np.cumsum(sizes)])
         self.points = np.concatenate([surface.points for surface in self.surfaces]).astype(np.float64)
         self.neighbors = np.concatenate([s.neighbors + start for s, start in zip(self.surfaces, self.starts)])
-        self.partners = [choose_partners(t, len(clouds)) for t in range(len(clouds))]
-        self._partners, self._columns = np.array(self.partners), np.ascontiguousarray(self.points.T)
+        self.partners = np.array([choose_partners(t, len(clouds)) for t in range(len(clouds))])  # (F,P)
+        self._columns = np.ascontiguousarray(self.points.T)
         self.spacing = max(float(np.median([surface.spacing for surface in self.surfaces])), 1e-4)
         self.scales = [_OF_SPACING * max(surface.spacing, self.spacing) for surface in self.surfaces]
 
@@ -43,7 +43,7 @@ class Frames:
 
     def motions(self, trajectory: Trajectory) -> np.ndarray:
         """Returns the motions (F,P,3,4) of a trajectory from every frame to its partners."""
-        first, second = trajectory[:, None], trajectory[self._partners]
+        first, second = trajectory[:, None], trajectory[self.partners]
         turn = second[..., :3] @ first[..., :3].swapaxes(-1, -2)
         return np.concatenate([turn, second[..., 3:] - turn @ first[..., 3:]], -1)
 
@@ -53,7 +53,7 @@ class Frames:
         A cost is the mean over partner frames of Geman and McClure's d^2 / (d^2 + s^2), where d is the residual.
         """
         cost = np.zeros(len(self.points), np.float32)
-        nearest = np.zeros((len(self.points), len(self.partners[0])), np.int32)
+        nearest = np.zeros((len(self.points), self.partners.shape[1]), np.int32)
         for t, (others, motions) in enumerate(zip(self.partners, self.motions(trajectory))):
             own = self.slice(t)
             for column, (u, motion) in enumerate(zip(others, motions)):
@@ -64,18 +64,19 @@ class Frames:
         return cost, nearest
 
     def gain(self, current: np.ndarray, cost: np.ndarray, motions: np.ndarray, main: np.ndarray, price: float) -> float:
-        """Returns what connected points would save, on average, by a body (costs (N), motions (F,P,3,4)) over what they cost now.
+        """Returns what connected points would save, on average, by a body beside what they cost now.
 
-        price: of a point's distance from where the motions `main` would take it.
+        cost (N), motions (F,P,3,4): of the body. price: of a point's distance from where the motions `main` would take it.
         """
         away = np.empty(len(self.points), np.float32)
         displacement_kernel(self._columns, self.starts, motions, main, away)
         return gain_kernel(current, cost, away, price, self.neighbors, _LEAST_GAIN)
 
     def compare(self, motions: np.ndarray, hinge: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns how nearly two of K bodies (motions (K,F,P,3,4)) take every point to one place, f32 (N,K,row), see `alike_kernel`.
+        """Returns how nearly two of K bodies take every point to one place, f32 (N,K,row), see `alike_kernel`.
 
-        And how far, on average over partner frames, each body and the first take every point from each other, f32 (N,K).
+        And how far, on average over partner frames, each body and the first take it from each other, f32 (N,K). motions:
+        (K,F,P,3,4).
         """
         count, bodies = len(self.points), len(motions)
         alike, away = np.zeros((count, bodies, row_length(bodies)), np.float32), np.empty((count, bodies), np.float32)
