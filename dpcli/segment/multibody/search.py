@@ -15,6 +15,9 @@ from dpcli.segment.multibody.splits import split_bodies
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _SPLIT_GAIN = 1e-4  # of the energy, for which a round of splits is kept
+_SHOWN = (
+    0.8  # share of a body's matches in other frames that are its own points; hidden surfaces take matches of others
+)
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
@@ -59,7 +62,9 @@ class Search:
 
     def judged_anew(self, found: Explanation) -> Explanation:
         """Returns the explanation with labels by its bodies' motions as they now are, and without needless bodies."""
-        return self._prune(self._clean(label_points(self.frames, found.bodies, self.settings, found.label)))
+        return self._shown(
+            self._prune(self._clean(label_points(self.frames, found.bodies, self.settings, found.label)))
+        )
 
     def _first(self) -> Explanation:
         """Returns the explanation by the one body that explains most."""
@@ -106,6 +111,22 @@ class Search:
             if best.energy > found.energy:
                 break
             found = self._clean(best)
+        return found
+
+    def _shown(self, found: Explanation) -> Explanation:
+        """Returns the explanation without bodies that other frames don't show, the least shown one first.
+
+        What one frame alone sees of a surface has no match in the others, and any motion that brings it near other points
+        explains it better than its own.
+        """
+        while len(found.bodies) > 1:
+            shown = [
+                (found.label[body.nearest[found.label == k]] == k).mean()
+                for k, body in enumerate(found.bodies[1:], start=1)
+            ]
+            if min(shown) >= _SHOWN:
+                break
+            found = self._clean(self._without(found, int(np.argmin(shown)) + 1))
         return found
 
     def _without(self, found: Explanation, k: int) -> Explanation:
