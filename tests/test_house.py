@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,9 +44,15 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """What `ast.walk` finds in a file, the whole module first; many tests look at each file."""
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
 def imported(path: Path) -> Iterator[str]:
     """The modules of the package that a file imports, wherever the import stands."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dpcli"):
             for alias in node.names:
                 full = f"{node.module}.{alias.name}"
@@ -118,11 +125,11 @@ def test_no_folder_is_too_full():
 def test_every_folder_says_what_lives_there():
     for path in MODULES.values():
         if path.name == "__init__.py":
-            assert ast.get_docstring(ast.parse(path.read_text())), f"{path.relative_to(ROOT)} has no docstring"
+            assert ast.get_docstring(nodes(path)[0]), f"{path.relative_to(ROOT)} has no docstring"
 
 
 def functions(path: Path) -> Iterator[ast.FunctionDef]:
-    yield from (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+    yield from (node for node in nodes(path) if isinstance(node, ast.FunctionDef))
 
 
 def is_kernel(node: ast.FunctionDef) -> bool:
@@ -160,7 +167,7 @@ def test_only_the_command_line_prints_results():
     """Results go to stdout in `cli` (and in the programs of `reproduce`); other rooms may write to stderr."""
     for name, path in MODULES.items():
         if not name.startswith(("dpcli.cli", "dpcli.reproduce")):
-            for node in ast.walk(ast.parse(path.read_text())):
+            for node in nodes(path):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == "print":
                     assert any(one.arg == "file" for one in node.keywords), f"{name} line {node.lineno} prints"
 
@@ -176,7 +183,7 @@ def undocumented(node: ast.AST, name: str) -> Iterator[str]:
 
 
 def test_everything_public_is_documented():
-    assert [one for name, path in MODULES.items() for one in undocumented(ast.parse(path.read_text()), name)] == []
+    assert [one for name, path in MODULES.items() for one in undocumented(nodes(path)[0], name)] == []
 
 
 RELATIVE = ("What", "Which", "Where", "How", "Of", "Whether", "As", "With", "When", "Who")
@@ -185,7 +192,7 @@ RELATIVE = ("What", "Which", "Where", "How", "Of", "Whether", "As", "With", "Whe
 def test_docstrings_begin_with_a_subject_or_a_verb():
     """A relative clause alone says neither who acts nor what is returned."""
     for name, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
                 words = (ast.get_docstring(node) or "").split()
                 assert not words or words[0] not in RELATIVE, f"{name}: {' '.join(words[:8])} ..."
@@ -230,7 +237,7 @@ def test_docstrings_are_sentences():
         name: docstring.split("\n")[0]
         for module, path in MODULES.items()
         if not module.startswith("dpcli.cli.")
-        for name, docstring in described(ast.parse(path.read_text()), module)
+        for name, docstring in described(nodes(path)[0], module)
         if not begins_with_a_verb(docstring)
     }
     assert {name: line for name, line in found.items() if name not in OWN_SUBJECT} == {}

@@ -12,6 +12,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -21,6 +23,7 @@ import pytest
 from dpcli.segment.training.flow_store import FlowStore
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.file import read_skipped, write_skipped
+from tests.support.commands import typed
 from tests.support.prepare_helpers import ROOT, write_msr
 from tests.support.sessions import members
 
@@ -58,9 +61,24 @@ def mounting(tmp_path) -> None:
         pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
 
 
+@pytest.fixture(scope="module")
+def undisturbed(raw) -> Callable[[str], str]:
+    """The digest of a run that nothing stopped, with such options; each is made once."""
+
+    @cache
+    def digest(more: str) -> str:
+        path = raw.with_name(f"whole{more}.h5")
+        assert typed("prepare", "msraction3d", raw, "-o", path, "--jobs", "1", *more.split()) == 0
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+    return digest
+
+
 @pytest.mark.parametrize("jobs", ["1", "2"])
 @pytest.mark.parametrize("more", ["", "--compression gzip", "--points 900 --sampling fps"])
-def test_a_full_disk_keeps_what_is_done_and_the_same_command_continues(raw, tmp_path, dpc, jobs, more, mounting):
+def test_a_full_disk_keeps_what_is_done_and_the_same_command_continues(
+    raw, tmp_path, undisturbed, jobs, more, mounting
+):
     """A file system of 2 MiB for 11 MB of points, then of room enough; the bytes are those of a run that nothing stopped."""
     command = f'"{sys.executable}" -m dpcli prepare msraction3d "$RAW" -o "$D/out.h5" --jobs {jobs} {more}'
     size = {"": "2m", "--compression gzip": "6m"}.get(more, "1m")
@@ -77,8 +95,7 @@ def test_a_full_disk_keeps_what_is_done_and_the_same_command_continues(raw, tmp_
         rf"out.h5: no space left on the device \({sizes}\); the [1-9]\d* samples done are kept. Make room", told
     ), told
     assert "continuing: " in told and "Traceback" not in told
-    assert dpc("prepare", "msraction3d", raw, "-o", tmp_path / "whole.h5", "--jobs", "1", *more.split()).returncode == 0
-    assert said[7].split()[0] == hashlib.sha256((tmp_path / "whole.h5").read_bytes()).hexdigest()
+    assert said[7].split()[0] == undisturbed(more)
 
 
 @pytest.mark.parametrize(
@@ -305,27 +322,27 @@ def test_a_dead_end_of_the_pipe_ends_the_chain(raw):
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_the_file_says_what_was_skipped_and_why(tmp_path, dpc, jobs):
+def test_the_file_says_what_was_skipped_and_why(tmp_path, dpc_here, jobs):
     folder = write_msr(tmp_path / "raw", NAMES[:3])
     (folder / "a09_s01_e01_sdepth.bin").write_bytes(b"")
     output = tmp_path / "out.h5"
     words = ("prepare", "msraction3d", folder, "-o", output, "--jobs", jobs)
-    assert dpc(*words).returncode == 0
+    assert dpc_here(*words).returncode == 0
     with h5py.File(output) as file:
         assert file.attrs["skipped"] == 1
-    told = json.loads(dpc("info", output, "--json").stdout)["skipped"]
+    told = json.loads(dpc_here("info", output, "--json").stdout)["skipped"]
     assert [entry["name"] for entry in told] == ["a09_s01_e01"] and "0 bytes" in told[0]["reason"]
-    assert "skipped              a09_s01_e01: " in dpc("info", output).stdout.decode()
-    again = dpc(*words)
+    assert "skipped              a09_s01_e01: " in dpc_here("info", output).stdout.decode()
+    again = dpc_here(*words)
     assert "already complete" in again.stderr.decode() and b"1 skipped" in again.stdout
 
 
-def test_nothing_skipped_leaves_no_word(tmp_path, dpc):
+def test_nothing_skipped_leaves_no_word(tmp_path, dpc_here):
     folder = write_msr(tmp_path / "raw", NAMES[:2])
-    assert dpc("prepare", "msraction3d", folder, "-o", tmp_path / "out.h5", "--jobs", "1").returncode == 0
+    assert dpc_here("prepare", "msraction3d", folder, "-o", tmp_path / "out.h5", "--jobs", "1").returncode == 0
     with h5py.File(tmp_path / "out.h5") as file:
         assert "skipped" not in file and "skipped" not in file.attrs
-    assert b"\nskipped" not in dpc("info", tmp_path / "out.h5").stdout
+    assert b"\nskipped" not in dpc_here("info", tmp_path / "out.h5").stdout
 
 
 def test_many_and_odd_reasons_survive(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -61,9 +62,9 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
     return path
 
 
-def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
+def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc_here, one_thread):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
-    done = dpc(
+    done = dpc_here(
         "generate4d",
         "fit",
         views,
@@ -84,9 +85,9 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
-    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(100, 60))
+    same = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(100, 60))
     assert same.returncode == 0 and "already complete" in same.stderr.decode()
-    again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
+    again = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
     assert again.returncode == 2 and "--force" in again.stderr.decode()
 
 
@@ -128,21 +129,23 @@ def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
         assert longest.max() <= np.log(2) + 1e-4
 
 
-def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
+def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc_here, one_thread):
+    """Stopped from outside in a process of its own, and gone on with in this one."""
     views = toy_views(tmp_path / "views.h5")
-    options = ("--preset", "tiny", *steps(60, 60), "--device", "cpu")
-    whole = dpc("generate4d", "fit", views, "-o", tmp_path / "whole.h5", *options)
+    words = ("generate4d", "fit", views, "--preset", "tiny", *steps(30, 50), "--size", 16, "--device", "cpu")
+    whole = dpc_here(*words, "-o", tmp_path / "whole.h5")
     assert whole.returncode == 0, whole.stderr
-    command = [sys.executable, "-m", "dpcli", "generate4d", "fit", str(views), "-o", str(tmp_path / "cut.h5"), *options]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "dpcli", *map(str, words), "-o", str(tmp_path / "cut.h5")]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     log = tmp_path / "cut.fit" / "log.json"
     deadline = time.monotonic() + 120
     while not log.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+        time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 75 and "run the same command again" in process.stderr.read()
     assert not (tmp_path / "cut.h5").exists() and (tmp_path / "cut.fit" / "state.pt").exists()
-    rest = subprocess.run(command, capture_output=True, text=True)
+    rest = dpc_here(*words, "-o", tmp_path / "cut.h5")
     assert rest.returncode == 0, rest.stderr
     one, two = read_scene(tmp_path / "whole.h5"), read_scene(tmp_path / "cut.h5")
     np.testing.assert_array_equal(one.frame_mean, two.frame_mean)

@@ -9,6 +9,7 @@ import pytest
 from dpcli.reproduce import runs, table_4_1
 from dpcli.reproduce.table_4_1 import METRICS, ROWS, table
 from dpcli.store import CloudsReader
+from tests.support.commands import exit_code
 
 
 def test_rows_have_the_thesis_numbers_and_grow_by_one_switch() -> None:
@@ -23,9 +24,9 @@ def test_table_says_what_is_missing() -> None:
 
 
 @pytest.fixture(scope="module")
-def objects(dpc, tmp_path_factory) -> Path:
+def objects(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("table") / "objects.h5"
-    made = dpc(
+    made = exit_code(
         "prepare",
         "synthetic",
         "articulated",
@@ -44,7 +45,7 @@ def objects(dpc, tmp_path_factory) -> Path:
         "--fractions",
         "0.5,0,0.5",
     )
-    assert made.returncode == 0, made.stderr.decode()
+    assert made == 0
     with CloudsReader(path) as reader:
         assert {"train", "test"} <= set(reader.splits)
     return path

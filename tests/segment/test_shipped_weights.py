@@ -18,16 +18,15 @@ def test_every_shipped_model_loads_has_a_card_and_names_no_machine():
         assert notes["supervised"] is False
 
 
-def test_it_finds_parts_of_objects_it_never_saw(dpc, tmp_path):
+def test_it_finds_parts_of_objects_it_never_saw(dpc_here, one_thread, tmp_path):
     """Procedural objects are not what it learned from; it beats "all one part" on them."""
-    made = dpc(
-        "prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", "--objects", 6, "--sequences-per-object", 1
-    )
+    words = ("--objects", 6, "--sequences-per-object", 1)
+    made = dpc_here("prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", *words)
     assert made.returncode == 0, made.stderr.decode()
     score = {}
     for name, words in {"ours": ["--fast"], "one": ["--method", "ward", "--parts", 1]}.items():
-        done = dpc("segment", "predict", tmp_path / "o.h5", "-o", tmp_path / f"{name}.h5", *words)
+        done = dpc_here("segment", "predict", tmp_path / "o.h5", "-o", tmp_path / f"{name}.h5", *words)
         assert done.returncode == 0, done.stderr.decode()
-        judged = dpc("evaluate", "segmentation", tmp_path / f"{name}.h5", "--truth", tmp_path / "o.h5", "--json")
+        judged = dpc_here("evaluate", "segmentation", tmp_path / f"{name}.h5", "--truth", tmp_path / "o.h5", "--json")
         score[name] = json.loads(judged.stdout)["metrics"]
     assert score["ours"]["miou"] > score["one"]["miou"] + 0.05 and score["ours"]["ri"] > score["one"]["ri"]

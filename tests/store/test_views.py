@@ -220,7 +220,7 @@ def test_a_reader_travels_to_workers_without_its_handle(tmp_path):
             np.testing.assert_array_equal(copy.rgba(2, 3), picture(2, 3))
 
 
-def test_info_tells_cameras_and_draws_every_view(tmp_path, dpc):
+def test_info_tells_cameras_and_draws_every_view(tmp_path, dpc_here):
     from PIL import Image
 
     header = make_header(size=(40, 30))
@@ -237,8 +237,8 @@ def test_info_tells_cameras_and_draws_every_view(tmp_path, dpc):
         assert camera["azimuth"] == pytest.approx(np.rad2deg(0.5 * view), abs=1e-9)
         assert camera["elevation"] == pytest.approx(np.rad2deg(0.1 * view), abs=1e-9)
         assert (camera["radius"], camera["fovy"]) == (pytest.approx(2), pytest.approx(49.1))
-    result = dpc("info", path, "--picture", tmp_path / "sheet.png")
+    result = dpc_here("info", path, "--picture", tmp_path / "sheet.png")
     assert result.returncode == 0 and b"view 2" in result.stdout and b"40x30" in result.stdout
     colors = {tuple(c) for c in np.array(Image.open(tmp_path / "sheet.png").convert("RGB")).reshape(-1, 3).tolist()}
     assert {(255, 0, 0), (127, 127, 255), (255, 255, 255)} <= colors  # half-transparent blue lies on white
-    assert dpc("info", path, "--picture", tmp_path / "s.png", "--view", "xyz").returncode == 2
+    assert dpc_here("info", path, "--picture", tmp_path / "s.png", "--view", "xyz").returncode == 2

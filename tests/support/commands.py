@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from unittest import mock
+
 from dpcli.cli.app import main
 
 
@@ -12,3 +15,9 @@ def exit_code(*words: object) -> int:
     except SystemExit as ended:
         return int(ended.code or 0)
     return 0
+
+
+def typed(*words: object) -> int:
+    """As `exit_code`, and files tell of this command line: what a process of its own would write, to the byte."""
+    with mock.patch.object(sys, "argv", ["dpc", *map(str, words)]):
+        return exit_code(*words)

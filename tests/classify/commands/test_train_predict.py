@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.classify.commands import predict
 from dpcli.classify.confidence import stored_confidence
 from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.data.videos import held_out
@@ -134,35 +135,41 @@ def ending(work, numbered):
         raise MemoryError
     if len(scored) == after + 1:
         os.kill(os.getpid(), number)
-    print("scored", numbered[0], file=sys.stderr)
     return whole(work, numbered)
 commands.ScoreVideo.__call__ = ending
 main()
 """
 
 
+@pytest.fixture(scope="module")
+def whole_scores(data, run_folder) -> Path:
+    """A prediction of all videos that nothing stopped."""
+    path = data.parent / "whole.h5"
+    assert exit_code("classify", "predict", data, "--model", run_folder, "--split", "all", "-o", path) == 0
+    return path
+
+
 @pytest.mark.parametrize(("number", "kept"), [(signal.SIGTERM, 4), (signal.SIGKILL, 3), (0, 3)])  # 0: too little memory
-def test_a_stopped_and_a_killed_prediction_go_on(data, run_folder, dpc_here, tmp_path, number, kept):
-    words = ["classify", "predict", data, "--model", run_folder, "--split", "all", "-o"]
-    assert dpc_here(*words, tmp_path / "whole.h5").returncode == 0
-
-    def started(output: Path, signal_number: int, after: int) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-c", ENDS_EARLY, int(signal_number), after, *words, output]
-        return subprocess.run(
-            [str(word) for word in command], capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
-        )
-
-    first = started(tmp_path / "s.h5", number, 3)
+def test_a_stopped_and_a_killed_prediction_go_on(
+    data, run_folder, whole_scores, dpc_here, tmp_path, monkeypatch, number, kept
+):
+    words = ["classify", "predict", data, "--model", run_folder, "--split", "all", "-o", tmp_path / "s.h5"]
+    command = [sys.executable, "-c", ENDS_EARLY, int(number), 3, *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    first = subprocess.run([str(word) for word in command], capture_output=True, env=environment)
     assert first.returncode == {signal.SIGTERM: 75, signal.SIGKILL: -9}.get(number, 1), first.stderr.decode()
     assert not (tmp_path / "s.h5").exists()
     if number == signal.SIGTERM:
         assert b"4 of 12 videos are kept; run the same command again to continue" in first.stderr
-    words.insert(2, "--batch=2")
-    second = started(tmp_path / "s.h5", number, 99)
-    assert second.returncode == 0 and second.stderr.count(b"scored ") == 12 - kept + 1  # and the sentence
+    score, scored = predict.ScoreVideo.__call__, []
+    monkeypatch.setattr(
+        predict.ScoreVideo, "__call__", lambda work, numbered: scored.append(numbered[0]) or score(work, numbered)
+    )
+    second = dpc_here(*words, "--batch=2")
+    assert second.returncode == 0 and len(scored) == 12 - kept
     assert f"continuing: {kept} of 12 videos were scored before".encode() in second.stderr
-    assert {path.name for path in tmp_path.iterdir()} == {"whole.h5", "s.h5"}
-    ours, whole = ScoresReader(tmp_path / "s.h5"), ScoresReader(tmp_path / "whole.h5")
+    assert [path.name for path in tmp_path.iterdir()] == ["s.h5"]
+    ours, whole = ScoresReader(tmp_path / "s.h5"), ScoresReader(whole_scores)
     assert ours.names == whole.names and ours.splits == whole.splits and ours.labels.tolist() == whole.labels.tolist()
     for name, own in (("scores", ours.scores), *ours.streams.items()):  # clips share batches otherwise: rounding
         np.testing.assert_allclose(own, whole.scores if name == "scores" else whole.streams[name], atol=1e-5)
@@ -295,24 +302,11 @@ def test_weights_of_another_model_are_told(data, run_folder, dpc_here, tmp_path)
         assert done.returncode == 0 and (b"another model" in done.stderr) == told, done.stderr
 
 
-def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc, tmp_path):
+def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc_here, tmp_path):
     """SIGTERM in the middle of an epoch saves the step and exits 75; kill -9 loses at most the epoch in hand."""
     folder = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "dpcli",
-        "classify",
-        "train",
-        str(data),
-        "-o",
-        str(folder),
-        *TRAIN,
-        "--epochs",
-        "2",
-        "--set",
-        "epochs_dynamic=2",
-    ]
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", "2", "--set", "epochs_dynamic=2")
+    command = [sys.executable, "-m", "dpcli", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     first = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment)
     wait_for(folder / "state.pt", first)
@@ -324,7 +318,7 @@ def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folde
     time.sleep(4)
     second.kill()
     second.wait()
-    third = subprocess.run(command, capture_output=True, env=environment)
+    third = dpc_here(*words)
     assert third.returncode == 0, third.stderr.decode()
     ours, whole = last_weights(folder), last_weights(run_folder)
     # The same steps in the same order, to rounding: after a first compilation weights were 5e-7 of their norm apart (cause unknown), and

@@ -267,16 +267,16 @@ def test_shipped_models_load_and_have_a_card():
         load_model("nonesuch")
 
 
-def test_the_shipped_model_recognizes_real_depth_videos(shared_data, tmp_path, dpc):
+def test_the_shipped_model_recognizes_real_depth_videos(shared_data, tmp_path, dpc_here, one_thread):
     """Five test videos of five actions, from raw file to score: at least four right (93.5 % expected)."""
     for name in ("a01_s06_e01", "a10_s06_e01", "a13_s07_e01", "a16_s08_e01", "a19_s09_e01"):
         (tmp_path / f"{name}_sdepth.mat").symlink_to(shared_data / "msraction3d" / f"{name}_sdepth.mat")
-    prepared = dpc("prepare", "msraction3d", tmp_path, "-o", tmp_path / "clouds.h5", "--jobs", 1)
+    prepared = dpc_here("prepare", "msraction3d", tmp_path, "-o", tmp_path / "clouds.h5", "--jobs", 1)
     assert prepared.returncode == 0, prepared.stderr.decode()
     words = ("--model", "msraction3d-16", "-o", tmp_path / "scores.h5")
-    scored = dpc("classify", "predict", tmp_path / "clouds.h5", *words)
+    scored = dpc_here("classify", "predict", tmp_path / "clouds.h5", *words)
     assert scored.returncode == 0, scored.stderr.decode()
-    report = dpc("evaluate", "classification", tmp_path / "scores.h5", "--json")
+    report = dpc_here("evaluate", "classification", tmp_path / "scores.h5", "--json")
     assert json.loads(report.stdout)["metrics"]["accuracy"] >= 0.8
 
 

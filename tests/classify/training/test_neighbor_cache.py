@@ -96,7 +96,7 @@ def test_a_backbone_that_groups_points_of_its_own_is_refused(tmp_path):
 
 
 def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data, tmp_path, monkeypatch):
-    words = (*SMALL, "--set", "epochs_dynamic=5", "--set", "draws=2", "--set", "accumulate=2")
+    words = (*SMALL, "--set", "epochs_dynamic=3", "--set", "draws=2", "--set", "accumulate=2")
     searched: list[int] = []
 
     class Counting(NeighborCache):
@@ -110,7 +110,7 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
     for name, kind in (("kept", Counting), ("searched", Forgetting)):
         monkeypatch.setattr(training, "NeighborCache", kind)
         assert dpc("classify", "train", data, "-o", tmp_path / name, *words) == 0
-    assert sum(searched) == 2 * 8  # eight training videos, two draws; five epochs
+    assert sum(searched) == 2 * 8  # eight training videos, two draws; three epochs
     kept, anew = last_weights(tmp_path / "kept"), last_weights(tmp_path / "searched")
     assert all(torch.equal(kept[key], anew[key]) for key in kept)
     assert {path.name for path in (tmp_path / "kept").iterdir()} == {
@@ -127,7 +127,7 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
             tmp_path / "fresh",
             *SMALL,
             "--set",
-            "epochs_dynamic=5",
+            "epochs_dynamic=3",
             "--set",
             "accumulate=2",
         )
@@ -139,7 +139,7 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
 
 
 def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):
-    words = (*SMALL, "--set", "epochs_dynamic=4", "--set", "draws=2")
+    words = (*SMALL, "--set", "epochs_dynamic=3", "--set", "draws=2")
     assert dpc("classify", "train", data, "-o", tmp_path / "whole", *words) == 0
     take, taken = training.Trainer._take, []
 

@@ -262,28 +262,13 @@ def test_single_files_and_an_instant(scene_file, tmp_path):
         export_scene(str(scene_file), str(tmp_path / "a.ply"), time=None, **usual)
 
 
-def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):
+def test_an_export_flows_into_the_segmenter(dpc, dpc_here, scene_file, tmp_path):
     clouds = dpc("generate4d", "export", scene_file, "--as", "clouds", "--points", "200", "-o", "-")
     assert clouds.returncode == 0, clouds.stderr.decode()
-    parts = tmp_path / "parts.h5"
-    said = dpc(
-        "segment",
-        "predict",
-        "-",
-        "-o",
-        parts,
-        "--method",
-        "ward",
-        "--parts",
-        "2",
-        "--flow",
-        "nearest",
-        "--set",
-        "icp=0",
-        stdin=clouds.stdout,
-    )
-    assert said.returncode == 0, said.stderr.decode()
     (tmp_path / "clouds.h5").write_bytes(clouds.stdout)
+    parts, words = tmp_path / "parts.h5", "--method ward --parts 2 --flow nearest --set icp=0".split()
+    said = dpc_here("segment", "predict", tmp_path / "clouds.h5", "-o", parts, *words)
+    assert said.returncode == 0, said.stderr.decode()
     with CloudsReader(tmp_path / "clouds.h5") as reader, PartsReader(parts) as predicted:
         assert reader.names == predicted.names == ["toy"]
         assert reader.fields == ("time", "color", "part", "track", "pose")
@@ -293,9 +278,9 @@ def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["ply", "splat"])
-def test_the_command_leaves_nothing_but_numbered_frames_in_the_folder(dpc, scene_file, tmp_path, form):
+def test_the_command_leaves_nothing_but_numbered_frames_in_the_folder(dpc_here, scene_file, tmp_path, form):
     """SuperSplat plays a folder where every name is NAME NUMBER.ply, and else loads all frames on top of each other."""
-    done = dpc("generate4d", "export", scene_file, "--as", form, "-o", tmp_path / "frames")
+    done = dpc_here("generate4d", "export", scene_file, "--as", form, "-o", tmp_path / "frames")
     assert done.returncode == 0, done.stderr
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert len(names) > 1 and all(re.fullmatch(rf"\D*\d+\.{form}", name) for name in names)

@@ -367,10 +367,10 @@ def project(points: np.ndarray, header, view: int) -> np.ndarray:
     return np.clip(np.floor(pixel[:, :2] / pixel[:, 2:]).astype(int), 0, header.size[0] - 1)
 
 
-def test_from_the_command_line(tmp_path, dpc):
+def test_from_the_command_line(tmp_path, dpc_here):
     path, out, again = arm().write(tmp_path / "arm.glb"), tmp_path / "a.h5", tmp_path / "b.h5"
     options = ("--frames", 5, "--size", 48, "--azimuths", "60,-60", "--train-azimuths", "45", "--tracks", 64)
-    done = dpc("prepare", "animation", path, "-o", out, *options, "--clip", "Bend", "--jobs", 1)
+    done = dpc_here("prepare", "animation", path, "-o", out, *options, "--clip", "Bend", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert b"arm Rig|Bend, 4 views, 5 frames, 48x48" in done.stdout
     with ViewsReader(out) as reader:
@@ -378,14 +378,14 @@ def test_from_the_command_line(tmp_path, dpc):
         assert reader.track.shape == (5, 64, 3) and set(reader.part) == {0, 1}
         assert all(reader.rgba(view, frame)[..., 3].any() for view in range(4) for frame in range(5))
         np.testing.assert_allclose(reader.header.time, np.arange(5) / 5)
-    assert dpc("prepare", "animation", path, "-o", again, *options, "--clip", "Bend", "--jobs", 2).returncode == 0
+    assert dpc_here("prepare", "animation", path, "-o", again, *options, "--clip", "Bend", "--jobs", 2).returncode == 0
     assert out.read_bytes() == again.read_bytes()  # whatever the number of processes
-    listed = dpc("prepare", "animation", path, "--list", "--json")
+    listed = dpc_here("prepare", "animation", path, "--list", "--json")
     assert json.loads(listed.stdout) == {"clips": [{"name": "Rig|Bend", "seconds": 1.0}]}
     with pytest.raises(UsageError, match="-o/--output FILE is missing"):
         animation(path, options=FilmingOptions())
     path.write_bytes(path.read_bytes()[:-9])
-    broken = dpc("prepare", "animation", path, "-o", tmp_path / "c.h5")
+    broken = dpc_here("prepare", "animation", path, "-o", tmp_path / "c.h5")
     assert broken.returncode == 3 and b"truncated" in broken.stderr and b"Traceback" not in broken.stderr
 
 

@@ -558,10 +558,10 @@ def test_any_end_of_a_clip_s_name_behind_a_bar_names_it(tmp_path, wanted):
     assert load_animation(path, wanted, 2).name == "m Armature|mixamo.com|Layer0"
 
 
-def test_all_clips_at_once(tmp_path, dpc):
+def test_all_clips_at_once(tmp_path, dpc_here):
     path = named("Rig|Walk", "Rig|run/fast", "walk", "").write(tmp_path / "m.glb")
     options = ("--frames", 2, "--size", 16, "--tracks", 8, "--jobs", 1, "--azimuths", "60")
-    done = dpc("prepare", "animation", path, "-o", tmp_path / "v.h5", *options, "--all-clips")
+    done = dpc_here("prepare", "animation", path, "-o", tmp_path / "v.h5", *options, "--all-clips")
     assert done.returncode == 0, done.stderr
     assert sorted(file.name for file in tmp_path.glob("*.h5")) == [
         "v_Walk_0.h5",
@@ -570,7 +570,7 @@ def test_all_clips_at_once(tmp_path, dpc):
         "v_walk_2.h5",
     ]
     for odd in (("-o", "-"), ("-o", tmp_path / "v.h5", "--clip", "walk")):
-        assert dpc("prepare", "animation", path, *odd, "--all-clips").returncode == 2
+        assert dpc_here("prepare", "animation", path, *odd, "--all-clips").returncode == 2
 
 
 def test_a_clip_s_name_moves_no_cursor(tmp_path):

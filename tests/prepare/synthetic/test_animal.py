@@ -159,10 +159,10 @@ def test_seeds_make_different_animals_and_the_same_again():
             make_animal(frames=2, **wrong)
 
 
-def test_from_the_command_line(tmp_path, dpc):
+def test_from_the_command_line(tmp_path, dpc_here):
     out = tmp_path / "fish.h5"
     words = ("--motion", "swim", "--frames", 3, "--size", 64, "--azimuths", "90", "--tracks", 200, "--jobs", 1)
-    done = dpc("prepare", "synthetic", "animal", "-o", out, *words, "--seed", 2)
+    done = dpc_here("prepare", "synthetic", "animal", "-o", out, *words, "--seed", 2)
     assert done.returncode == 0, done.stderr
     with ViewsReader(out) as reader:
         assert reader.header.role == ["reference", "test"] and reader.track.shape == (3, 200, 3)
@@ -176,4 +176,4 @@ def test_from_the_command_line(tmp_path, dpc):
                 around = maximum_filter(alpha, 3)  # a point of the outline may lie in a pixel that no ray hit
                 assert (around[row, column] > 0).all() and (alpha[row, column] > 0).mean() > 0.9
                 assert 0.02 < (alpha > 0).mean() < 0.5
-    assert dpc("prepare", "synthetic", "animal", "-o", out, "--motion", "hop").returncode == 2
+    assert dpc_here("prepare", "synthetic", "animal", "-o", out, "--motion", "hop").returncode == 2

@@ -415,13 +415,13 @@ def test_shapes_of_the_volumes(own):
         artemis_clip(own, WALK)
 
 
-def test_the_command(tmp_path, animal, dpc):
+def test_the_command(tmp_path, animal, dpc_here):
     out = tmp_path / "a.h5"
-    listed = dpc("prepare", "artemis", animal[0], "-o", out)
+    listed = dpc_here("prepare", "artemis", animal[0], "-o", out)
     assert listed.returncode == 2 and b"walk (5 frames)" in listed.stderr
-    done = dpc("prepare", "artemis", animal[0], "--motion", "walk", "--size", 48, "--tracks", 64, "-o", out)
+    done = dpc_here("prepare", "artemis", animal[0], "--motion", "walk", "--size", 48, "--tracks", 64, "-o", out)
     assert done.returncode == 0, done.stderr
     with ViewsReader(out) as reader:
         assert (reader.num_views, reader.num_frames, reader.header.name) == (5, FRAMES, "panda-walk")
         assert reader.track.shape == (FRAMES, 64, 3) and reader.part.shape == (64,)
-    assert dpc("prepare", "artemis", tmp_path, "--motion", "walk", "-o", tmp_path / "b.h5").returncode == 3
+    assert dpc_here("prepare", "artemis", tmp_path, "--motion", "walk", "-o", tmp_path / "b.h5").returncode == 3

@@ -805,23 +805,23 @@ def test_cameras_that_do_not_tell_how_far_the_object_is(tmp_path, cameras, messa
 # ---- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, dpc):
+def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, dpc_here, dpc):
     folder = save(tmp_path / "clip", moving(3))
     out = tmp_path / "clip.h5"
-    assert dpc("prepare", "video", folder, "--size", 32, "-o", out).returncode == 0
+    assert dpc_here("prepare", "video", folder, "--size", 32, "-o", out).returncode == 0
     with ViewsReader(out) as reader:
         assert reader.header.size == (32, 32) and reader.header.name == "clip"
         assert reader.provenance[0]["config"]["size"] == 32
     before = out.read_bytes()
-    again = dpc("prepare", "video", folder, "--size", 32, "-o", out)
+    again = dpc_here("prepare", "video", folder, "--size", 32, "-o", out)
     assert again.returncode == 0 and b"already complete" in again.stderr and out.read_bytes() == before
-    other = dpc("prepare", "video", folder, "--size", 48, "-o", out)
+    other = dpc_here("prepare", "video", folder, "--size", 48, "-o", out)
     assert other.returncode == 2 and b"size 32, now 48" in other.stderr
     save(folder, moving(4))
-    assert dpc("prepare", "video", folder, "--size", 32, "-o", out).returncode == 2  # another input
+    assert dpc_here("prepare", "video", folder, "--size", 32, "-o", out).returncode == 2  # another input
     piped = dpc("prepare", "video", folder, "--size", 32, "-o", "-")
     assert piped.returncode == 0 and piped.stdout.startswith(b"\x89HDF")
-    bad = dpc("prepare", "video", tmp_path, "-o", tmp_path / "b.h5")
+    bad = dpc_here("prepare", "video", tmp_path, "-o", tmp_path / "b.h5")
     assert bad.returncode == 3 and b"no frames" in bad.stderr and not (tmp_path / "b.h5").exists()
 
 

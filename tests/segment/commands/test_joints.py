@@ -13,19 +13,38 @@ import pytest
 from dpcli.segment.commands.joints import find_joints
 from dpcli.store import CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
+from tests.support.commands import exit_code
 
 
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory, dpc):
-    path = tmp_path_factory.mktemp("joints") / "objects.h5"
-    words = "--objects 4 --sequences-per-object 1 --kinds cabinet,laptop --points 384 --frames 5 --joint-step 0.4"
-    done = dpc("prepare", "synthetic", "articulated", "-o", path, *words.split())
-    assert done.returncode == 0, done.stderr
+def objects(folder, count):
+    path = folder / "objects.h5"
+    words = "--sequences-per-object 1 --kinds cabinet,laptop --points 384 --frames 5 --joint-step 0.4".split()
+    assert exit_code("prepare", "synthetic", "articulated", "-o", path, "--objects", count, *words) == 0
     return path
 
 
 @pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    return objects(tmp_path_factory.mktemp("joints"), 4)
+
+
+@pytest.fixture(scope="module")
 def parts(truth):
+    return told(truth)
+
+
+@pytest.fixture(scope="module")
+def few_truth(tmp_path_factory):
+    """Two objects, for what isn't about how well joints are found."""
+    return objects(tmp_path_factory.mktemp("few"), 2)
+
+
+@pytest.fixture(scope="module")
+def few(few_truth):
+    return told(few_truth)
+
+
+def told(truth):
     """What a segmenter would say that knows everything."""
     path = truth.with_name("parts.h5")
     with CloudsReader(truth) as reader:
@@ -87,17 +106,17 @@ def test_the_urdf_is_posed_as_the_points_are(parts, tmp_path, dpc_here):
         assert np.median(far) < 0.02 and np.quantile(far, 0.95) < 0.06
 
 
-def test_joints_flow_through_a_pipe(truth, parts, dpc):
-    found = dpc("segment", "joints", parts, "-o", "-")
+def test_joints_flow_through_a_pipe(few_truth, few, dpc):
+    found = dpc("segment", "joints", few, "-o", "-")
     assert found.returncode == 0, found.stderr
-    scored = dpc("evaluate", "joints", "-", "--truth", truth, "--split", "all", "--json", stdin=found.stdout)
+    scored = dpc("evaluate", "joints", "-", "--truth", few_truth, "--split", "all", "--json", stdin=found.stdout)
     assert scored.returncode == 0 and json.loads(scored.stdout)["metrics"]["type"] > 0.8, scored.stderr
 
 
-def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
+def test_a_folder_holds_one_object_for_each_sequence(few, tmp_path, dpc_here):
     """A name with letters that XML has no place for makes a robot that can be read, too."""
     odd = tmp_path / "odd.h5"
-    shutil.copyfile(parts, odd)
+    shutil.copyfile(few, odd)
     with h5py.File(odd, "r+") as file:
         names = [name.decode() for name in file["name"][:]]
         file["name"][0] = names[0] + "\x1b[31m\n"
@@ -107,11 +126,11 @@ def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
     assert set(names[1:]) < set(found) and names[0] + "\\x1b[31m\\n" in found.values() and len(found) == len(names)
 
 
-def test_a_folder_that_could_not_be_filled_is_not_left(parts, tmp_path, monkeypatch):
+def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatch):
     """Else the same command, which a full disk's sentence asks for, would be refused for what it had left."""
 
     def make():
-        find_joints(str(parts), tmp_path / "new" / "robots", sequence=None, picture=None, force=False)
+        find_joints(str(few), tmp_path / "new" / "robots", sequence=None, picture=None, force=False)
 
     with monkeypatch.context() as patch:
         patch.setattr(

@@ -10,9 +10,11 @@ import pytest
 from dpcli.store.parts import PartsReader
 
 
-def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tmp_path):
+def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc_here, data, run_folder, tmp_path, dpc):
     predict = ("segment", "predict", data, "--model", run_folder, "--flow", "nearest", "--points", 48, "--pairs", "all")
-    done = dpc(*predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply")
+    done = dpc_here(
+        *predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply"
+    )
     assert done.returncode == 0, done.stderr.decode()
     assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(
         list((tmp_path / "ply").rglob("*.ply"))
@@ -27,7 +29,7 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tm
         assert sample.pairs.tolist() == [[i, j] for i in range(3) for j in range(3) if i != j]
         assert np.allclose(sample.probability.sum(1), 1, atol=1e-4)
         assert (sequence.part == sample.probability.argmax(1)).all()
-    motion = dpc("evaluate", "motion", tmp_path / "parts.h5", "--truth", data, "--json")
+    motion = dpc_here("evaluate", "motion", tmp_path / "parts.h5", "--truth", data, "--json")
     assert motion.returncode == 0 and np.isfinite(json.loads(motion.stdout)["metrics"]["epe3d"])
 
 
