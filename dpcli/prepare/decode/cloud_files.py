@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_npy, read_npz
+from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_mat, read_npy, read_npz
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.gaussians import read_splat, read_spz
 from dpcli.prepare.cloud_formats.las import read_las
@@ -38,6 +38,7 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".xyzi": read_text,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".mat": read_mat,
 }
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 
