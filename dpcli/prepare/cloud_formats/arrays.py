@@ -84,6 +84,8 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         return cloud_of_columns(path, {name: flat[name] for name in array.dtype.names}, keep)
     if keep:
         raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
+    if array.shape == (0,):  # of an empty list of points
+        return Cloud(np.zeros((0, 3), np.float32))
     if array.ndim == 3 and array.shape[0] == 1:  # a batch of one
         array = array[0]
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "uif":

@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import pytest
 
-from dpcli.prepare.array_files.safe_pickle import load_arrays
 from dpcli.prepare.array_files import safe_pickle
+from dpcli.prepare.array_files.safe_pickle import load_arrays
 
 RNG = np.random.default_rng(0)
 HONEST = {
