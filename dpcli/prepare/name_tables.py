@@ -80,6 +80,10 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
         divider = next((mark for mark in ",;\t" if mark in first), ",")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
+    except DataError as error:
+        raise DataError(
+            str(error).replace("expected numbers in columns", f"expected a CSV table of name,{needed}")
+        ) from None
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; expected a CSV table of name,{needed}") from None
     except OSError as error:

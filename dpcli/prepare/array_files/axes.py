@@ -18,10 +18,8 @@ LETTERS = "BTNC"
 _MOST_COLUMNS = 10  # x y z and what is known of a point
 _LOOKED_AT, _SEQUENCES = 512, 4  # places along an axis that are looked at
 _PAIRS = 4096
-_SMOOTHER, _FAR = (
-    0.5,
-    0.3,
-)  # steps along one axis as a share of those along another; of the size, which no neighbors have
+_SMOOTHER = 0.5  # steps along one axis as a share of those along another
+_NEAR, _FAR = 0.1, 0.3  # steps as a share of the size: those of motion are below, those to what is no neighbor above
 _MATRICES = ((3, 3), (3, 4), (4, 4))
 
 
@@ -79,11 +77,11 @@ def axes_of(array: Any) -> str:
     some = np.moveaxis(np.asarray(array[tuple(key.get(axis, slice(None)) for axis in range(array.ndim))]), place, -1)
     shape = [array.shape[axis] for axis in others]
     some = some[..., :3].astype(np.float64)
-    letters = ""
+    letters, stacked = "", place == array.ndim - 1
     if array.ndim == 3:
-        letters = _of_one(some[None], shape[0], shape[1])
+        letters = _of_one(some[None], shape[0], shape[1], stacked)
     elif _is_rough(some):
-        letters = "B" + inner if (inner := _of_one(some, shape[1], shape[2])) else ""
+        letters = "B" + inner if (inner := _of_one(some, shape[1], shape[2], stacked)) else ""
     return letters[:place] + "C" + letters[place:] if letters else ""
 
 
@@ -95,18 +93,21 @@ def _is_rough(some: np.ndarray) -> bool:
     return steps > _FAR * size
 
 
-def _of_one(some: np.ndarray, first: int, second: int) -> str:
+def _of_one(some: np.ndarray, first: int, second: int, stacked: bool) -> str:
     """Returns TN or NT for the axes behind the first of some sequences (B,P,Q,3) of which there are so many in all; "" where
-    nothing decides.
+    nothing decides. stacked: coordinates come last, as where frames were put one after the other; then frames come first where
+    values say nothing.
     """
     if 1 in (first, second):
         return "TN" if first == 1 else "NT"
     along_first, along_second, size = _step(some, 1), _step(some, 2), _size(some)
     if along_first < _SMOOTHER * along_second:
-        return "TN" if along_second > _FAR * size or first < second else ""
+        near = along_first < _NEAR * size
+        return "TN" if near and along_second > _FAR * size or first < second and (near or stacked) else ""
     if along_second < _SMOOTHER * along_first:
-        return "NT" if along_first > _FAR * size and second <= first else ""
-    return "TN" if min(along_first, along_second) > _FAR * size and first <= second else ""
+        unlike = along_first > _FAR * size and along_second < _NEAR * size
+        return "NT" if unlike and second <= first else ""
+    return "TN" if stacked and min(along_first, along_second) > _FAR * size and first <= second else ""
 
 
 def _step(some: np.ndarray, axis: int) -> float:

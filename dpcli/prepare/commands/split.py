@@ -46,7 +46,7 @@ class SplitChoice:
             raise UsageError("--list, --subjects and --fractions were given together; use one")
         if self.fractions is not None:
             low, total = min(self.fractions), sum(self.fractions)
-            if low < 0 or abs(total - 1) > 1e-6:
+            if not (low >= 0 and abs(total - 1) <= 1e-6):  # NaN, too
                 raise UsageError(f"--fractions {self.fractions}: expected three numbers from 0 that sum to 1")
 
     def assign(self, source: Source, splits: Sequence[str], subjects: Sequence[int]) -> list[str]:

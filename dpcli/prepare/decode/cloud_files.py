@@ -15,6 +15,7 @@ from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.decode.e57_files import read_e57
 from dpcli.runtime.clips.other_files import stand_in
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
@@ -39,6 +40,7 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".splat": read_splat,
     ".spz": read_spz,
     ".mat": read_mat,
+    ".e57": read_e57,
 }
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 

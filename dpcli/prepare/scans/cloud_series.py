@@ -27,7 +27,7 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 )
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
-    ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
+    ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg"
     " .usd .usda .usdc .abc .blend .3ds"
@@ -42,7 +42,6 @@ _ADVICE = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
     **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
-    ".e57": "save their points as .ply, such as with CloudCompare",
 }
 
 
