@@ -20,6 +20,7 @@ _LOOKED_AT, _SEQUENCES = 512, 4  # places along an axis that are looked at
 _PAIRS = 4096
 _SMOOTHER = 0.5  # steps along one axis as a share of those along another
 _NEAR, _FAR = 0.1, 0.3  # steps as a share of the size: those of motion are below, those to what is no neighbor above
+_FEWER = 2  # times fewer frames than points, from which on the shape tells
 _MATRICES = ((3, 3), (3, 4), (4, 4))
 
 
@@ -101,13 +102,14 @@ def _of_one(some: np.ndarray, first: int, second: int, stacked: bool) -> str:
     if 1 in (first, second):
         return "TN" if first == 1 else "NT"
     along_first, along_second, size = _step(some, 1), _step(some, 2), _size(some)
+    fewer = _FEWER * first <= second
     if along_first < _SMOOTHER * along_second:
         near = along_first < _NEAR * size
-        return "TN" if near and along_second > _FAR * size or first < second and (near or stacked) else ""
+        return "TN" if near and along_second > _FAR * size or fewer and (near or stacked) else ""
     if along_second < _SMOOTHER * along_first:
         unlike = along_first > _FAR * size and along_second < _NEAR * size
         return "NT" if unlike and second <= first else ""
-    return "TN" if stacked and min(along_first, along_second) > _FAR * size and first <= second else ""
+    return "TN" if stacked and min(along_first, along_second) > _FAR * size and fewer else ""
 
 
 def _step(some: np.ndarray, axis: int) -> float:
@@ -127,8 +129,9 @@ def _size(some: np.ndarray) -> float:
 
 def _median_distance(first: np.ndarray, second: np.ndarray) -> float:
     real = np.isfinite(first).all(1) & np.isfinite(second).all(1) & first.any(1) & second.any(1)
-    between = np.linalg.norm(first[real] - second[real], axis=1)
-    return float(np.median(between)) if len(between) else 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that are no coordinates
+        between = np.linalg.norm(first[real] - second[real], axis=1)
+        return float(np.median(between)) if len(between) else 0.0
 
 
 def choices(shape: tuple[int, ...]) -> list[str]:

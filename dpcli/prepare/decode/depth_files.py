@@ -392,7 +392,7 @@ def _told_beside(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     from dpcli.prepare.decode.calibration import camera_of_arrays
 
     camera, scale, unread = camera_of_arrays(path, arrays)
-    notes = {f"videos whose .npz holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
+    notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
     return {"camera": camera, "scale": scale, "notes": notes}
 
 

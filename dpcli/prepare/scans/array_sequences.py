@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,16 +18,17 @@ from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.decode.folder_listing import files_below
+from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.prepare.scans.times_of_tables import seconds_of
-from dpcli.prepare.series import TEXTS, is_beside
+from dpcli.prepare.series import TEXTS, is_beside, is_hidden
 from dpcli.store.schema import kept_name
 
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
+_LOOKED_AT = 20  # files of a folder, of which the first good one tells
 
 
 def holds_sequences(raw: Path, others: tuple[str, ...]) -> bool:
@@ -36,12 +39,14 @@ def holds_sequences(raw: Path, others: tuple[str, ...]) -> bool:
         return raw.suffix.lower() in SUFFIXES
     if not raw.is_dir():
         return False
-    found = files_below(raw)
-    arrays = [path for path in found if path.suffix.lower() in SUFFIXES and not is_beside(path.name)]
-    apart = (suffix for suffix in others if suffix not in (*SUFFIXES, *TEXTS))
-    if not arrays or any(path.name.lower().endswith(tuple(apart)) for path in found):
-        return False
-    for path in sorted(arrays, key=lambda one: natural_key(one.relative_to(raw).as_posix())):
+    apart = tuple(suffix for suffix in others if suffix not in (*SUFFIXES, *TEXTS))
+    arrays = []
+    for folder, _, names in walk_folders(raw):  # frames are many: no path is made of each
+        shown = [name for name in names if not is_hidden(name)]
+        if any(name.lower().endswith(apart) for name in shown):
+            return False
+        arrays += [os.path.join(folder, name) for name in shown if _is_array(name)]
+    for path in map(Path, sorted(arrays)[:_LOOKED_AT]):
         try:
             if not made_by_dpc(path):
                 with open_arrays(path) as opened:
@@ -49,6 +54,10 @@ def holds_sequences(raw: Path, others: tuple[str, ...]) -> bool:
         except (DataError, OSError):
             continue  # a bad sample: the next one tells
     return False
+
+
+def _is_array(name: str) -> bool:
+    return name.lower().endswith(SUFFIXES) and not is_beside(name)
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,7 @@ class ArraySequences:
     label_from_folder: bool = False
     labels: Path | None = None
     keep: tuple[str, ...] = ()
+    pattern: str = ""
 
     def __post_init__(self) -> None:
         if self.labels and self.label_from_folder:
@@ -105,18 +115,22 @@ class ArraySequences:
             raise DataError(
                 f"{self.raw}: does not exist; expected a file of arrays ({', '.join(SUFFIXES)}), or a folder of them"
             )
-        files = [path for path in files_below(self.raw) if path.suffix.lower() in SUFFIXES and not is_beside(path.name)]
+        files = [path for path in files_below(self.raw) if _is_array(path.name) and self._is_wanted(path.name)]
         kept = sorted(
             (path for path in files if not made_by_dpc(path)),
             key=lambda path: natural_key(path.relative_to(self.raw).as_posix()),
         )
         named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in kept}
         if not named:
-            raise DataError(f"{self.raw}: no files of arrays ({', '.join(SUFFIXES)})")
+            asked = f" whose names fit --pattern '{self.pattern}'" if self.pattern else ""
+            raise DataError(f"{self.raw}: no files of arrays ({', '.join(SUFFIXES)}){asked}")
         if len(named) < len(kept):
             twin = next(path for path in kept if path not in named.values())
             raise DataError(f"{twin}: there is a file of the same name in another format; keep one of them")
         return named
+
+    def _is_wanted(self, name: str) -> bool:
+        return not self.pattern or fnmatchcase(name, self.pattern)
 
     @cached_property
     def _items(self) -> list[Item]:

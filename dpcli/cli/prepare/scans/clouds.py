@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
@@ -56,6 +56,7 @@ class CloudUnits:
 class TableColumns:
     """Holds the options of tables whose rows are the points of many frames."""
 
+    HEADING: ClassVar[str] = "Tables"
     frame_column: Annotated[
         str, typer.Option("--frame-column", help="Column that numbers the frames of a table. Default: by its name.")
     ] = ""
@@ -131,5 +132,5 @@ def _make_reader(
     if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
         return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
     if units.axes or holds_sequences(raw, SUFFIXES):
-        return ArraySequences(raw, units.axes, **shared)
+        return ArraySequences(raw, units.axes, pattern=pattern, **shared)
     return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)
