@@ -134,7 +134,8 @@ def _doubts_of_order(series: Series) -> str:
         return f"no number counts its frames; they are in the order of their names: {', '.join(series.names[:3])} ..."
     names = parse_names(series.names)
     found = _by_outer_numbers(names) if len({name.shape for name in names}) == 1 else None
-    if found is None or series.times() is not None or not 1 < len(found[0]) < len(names) / 2:
+    clocks = found is not None and (_are_clocks(names) or series.times() is not None)
+    if found is None or clocks or not 1 < len(found[0]) < len(names) / 2:
         return ""
     return (
         f"two numbers vary in the names of its frames ({series.pattern}); all {len(names)} are taken as one sequence, not the"

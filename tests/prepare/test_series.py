@@ -218,7 +218,8 @@ def test_counts_that_go_on_are_one_series_of_which_the_log_tells_two_numbers(tmp
 
 def test_minutes_and_seconds_are_one_count(tmp_path):
     names = [f"{k // 60:02d}_{k % 60:02d}.ply" for k in range(630, 730, 7)]
-    assert list(choose_series(tmp_path, names[::-1]).names) == names
+    series = choose_series(tmp_path, names[::-1])
+    assert list(series.names) == names and about_series([("a", series)]) == []
 
 
 @pytest.mark.parametrize("pair", (("Frame_", "frame_"), ("Bänd_", unicodedata.normalize("NFD", "Bänd_"))))
