@@ -14,13 +14,13 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 
-_ROOM, _PACKED_AT_MOST = 100 << 20, 50  # bytes that any file may unpack to; and times its size beyond them
+ROOM, PACKED_AT_MOST = 100 << 20, 50  # bytes that any file may unpack to; and times its size beyond them
 
 
 def require_room(path: Path, claimed: int) -> None:
     """Raises DataError where packed arrays claim far more bytes than clouds and depth do, which pack a few times smaller."""
     held = path.stat().st_size
-    if claimed > _ROOM + _PACKED_AT_MOST * held:
+    if claimed > ROOM + PACKED_AT_MOST * held:
         raise DataError(f"{path}: claims {claimed} bytes of arrays; a file of {held} bytes can't hold such clouds")
 
 

@@ -85,7 +85,7 @@ def test_what_is_imported_is_declared_and_nothing_more() -> None:
     optional = names(
         [
             text
-            for extra in ("cluster", "exr", "gsplat", "meshopt", "parquet", "recordings", "splats", "zero123")
+            for extra in ("cluster", "e57", "exr", "gsplat", "meshopt", "parquet", "recordings", "splats", "zero123")
             for text in extras[extra]
         ]
     )

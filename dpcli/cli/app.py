@@ -210,7 +210,7 @@ def _keeping_inputs(command: Any) -> Any:
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:
-        from dpcli.runtime.whole_file import check_writable
+        from dpcli.runtime.whole_file import check_regular, check_writable
         from dpcli.store.pipes import check_output
 
         inputs: list[str] = []
@@ -225,6 +225,8 @@ def _keeping_inputs(command: Any) -> Any:
                         else []
                     )
         for name, option in written.items():
+            if name != "output" and str(values.get(name)) == "-":
+                check_regular(Path("-"), option)
             if values.get(name) and str(values[name]) != "-":
                 check_output(Path(values[name]), option, inputs)
                 if name != "output" or values.get("force"):  # else it may be complete, and nothing is written

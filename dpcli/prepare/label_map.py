@@ -50,6 +50,9 @@ class LabelMap:
         tables = [content.get("labels", {}), *content.get("files", {}).values()]
         if any(not isinstance(t, dict) or any(not isinstance(v, str) for v in t.values()) for t in tables):
             raise DataError(f'{path}: a class is mapped to something that is no name; expected "old" = "new"')
+        classes = content.get("classes", [])
+        if not all(isinstance(one, str) and one for one in classes) or len(set(classes)) < len(classes):
+            raise DataError(f"{path}: classes {classes!r:.80}; expected names, each once")
         return cls(tuple(map(str, content.get("classes", ()))), content.get("labels", {}), content.get("files", {}))
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import unicodedata
 from collections import Counter
@@ -12,28 +11,13 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.reader import SPLITS, Item, split_called
+from dpcli.prepare.name_tables import places_of, read_rows, warn_of_splits
+from dpcli.prepare.reader import Item, split_called
 from dpcli.runtime.progress import log
 
-_COLUMNS = ("name", "label", "subject", "split")
-_CALLED = {"file": "name", "filename": "name", "path": "name", "video": "name", "sample": "name"} | {
-    "class": "label",
-    "category": "label",
-    "person": "subject",
-    "subset": "split",
-}
-_PERHAPS = {  # where no column is called as above; the first two only together
-    "name": "clip sequence recording id file_name video_id video_name sample_id sample_name sequence_id sequence_name",
-    "label": "action gesture activity target class_name label_name class_label",
-    "subject": "actor user performer participant signer subject_id person_id user_id",
-    "split": "set partition",
-}
-_SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
 _WHOLE = re.compile(r"^(-?\d+)\.0+$")  # as programs write a column of numbers that has a gap
 _NUMBERED = re.compile(r"([^\W\d]+[ _.-]?)(\d{1,9})")  # such as s01
 _BETWEEN = re.compile(r"[\s_-]+")
-_DIVIDER_TOLD = re.compile(r"\s*\"?sep=.\"?\s*\n")  # a first line for spreadsheets
-_NOTHING = {"nan", "null", "n/a", "#n/a"}  # as programs write a cell without a value
 
 
 @dataclass(frozen=True)
@@ -58,15 +42,7 @@ class LabelTable:
 
         Names may lack the suffix of a sample's, or have one more. Raises DataError when it names a stranger.
         """
-        found = _told_apart(item.name for item in items)
-        places = {written: found.get(_plain(written)) or found.get(_stem(written)) for written in self.rows}
-        strangers = sorted(written for written, name in places.items() if not name)
-        if strangers:
-            known = ", ".join(item.name for item in items[:3])
-            raise DataError(f"{self.path}: names {strangers[0]!r}, which is not among the samples ({known}, ...)")
-        twice = [name for name, count in Counter(places.values()).items() if count > 1]
-        if twice:
-            raise DataError(f"{self.path}: names {twice[0]!r} twice, with and without its suffix")
+        places = places_of(self.path, self.rows, [item.name for item in items])
         own = {places[written]: row for written, row in self.rows.items()}
         rows = ((item, own.get(item.name)) for item in items)
         return [replace(i, label=r.label, subject=r.subject, split=r.split) if r else i for i, r in rows]
@@ -77,84 +53,12 @@ class LabelTable:
         return [f"{len(names)} without a label in {self.path}: {', '.join(names[:5])}"] if names else []
 
 
-def _plain(name: str) -> str:
-    return unicodedata.normalize("NFC", name.replace("\\", "/").removeprefix("./").rstrip("/"))  # macOS splits letters
-
-
-def _stem(name: str) -> str:
-    return _SUFFIX.sub("", _plain(name))
-
-
-def _told_apart(names: Iterable[str]) -> dict[str, str]:
-    """Returns the names of samples by themselves, and by what they are without a suffix where that is one sample's."""
-    names = list(names)
-    stems = Counter(map(_stem, names))
-    return {_stem(name): name for name in names if stems[_stem(name)] == 1} | {_plain(name): name for name in names}
-
-
 def read_labels(path: Path) -> LabelTable:
-    """Reads columns ``name,label[,subject][,split]`` with a header line, or the first two without one.
+    """Reads columns ``name,label[,subject][,split]`` with a header line, or the first two without one, as `read_rows` does.
 
-    Commas, semicolons or tabs divide; further columns are passed over with a warning. Labels are whole numbers from 0,
-    or words; words are numbered in alphabetical order. DataError names file and line.
+    Labels are whole numbers from 0, or words; words are numbered in alphabetical order. DataError names file and line.
     """
-    from dpcli.prepare.cloud_formats.text_numbers import decode_text
-
-    try:
-        text = decode_text(path).lstrip("\ufeff")
-        if told := _DIVIDER_TOLD.match(text):
-            text = "\n" + text[told.end() :]  # lines keep their numbers
-        first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
-        divider = next((mark for mark in ",;\t" if mark in first), ",")
-        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; expected a CSV table of name,label") from None
-    except OSError as error:
-        raise DataError(
-            f"{path}: can't be read ({(error.strerror or str(error)).lower()}); expected a CSV table"
-        ) from None
-    except csv.Error as error:
-        raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
-    numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
-    while numbered and numbered[0][1][0].startswith("#"):  # comments above the header
-        numbered.pop(0)
-    header = list(_COLUMNS[:2])
-    if numbered and (names := _header(numbered[0][1])):
-        header = names
-        if "label" not in header or len(set(header)) < len(header):
-            found = ",".join(numbered[0][1])
-            raise DataError(f"{path}:{numbered[0][0]}: columns {found}; expected name,label and perhaps subject, split")
-        numbered.pop(0)
-        if others := [name for name in header if name and name not in _COLUMNS]:
-            log.warn(f"{path}: columns not read: {', '.join(others)}")
-    records: dict[str, dict[str, str]] = {}
-    for number, row in numbered:
-        record = dict(zip(header, row, strict=False))
-        row = row[: len(header)] if not any(row[len(header) :]) else row  # a line may end with the divider
-        lacking = not record.get("label") or record["label"].lower() in _NOTHING
-        if len(row) != len(header) or not record["name"] or lacking:
-            raise DataError(f"{path}:{number}: {','.join(row)!r}; expected {','.join(header)}")
-        if record["name"] in records:
-            raise DataError(f"{path}:{number}: {record['name']!r} appears twice")
-        records[record["name"]] = record | {"line": str(number)}
-    if not records:
-        raise DataError(f"{path}: no rows; expected {','.join(header)}")
-    return _number_labels(path, records)
-
-
-def _header(row: list[str]) -> list[str]:
-    """Returns the columns that a first line names, those we know as we call them; [] when it is no header."""
-    names = [_CALLED.get(cell.lower(), cell.lower()) for cell in row]
-    while names and not names[-1]:
-        names.pop()
-    guessed = list(names)
-    for field, words in _PERHAPS.items():
-        places = [place for place, name in enumerate(names) if name in words.split()]
-        if field not in names and len(places) == 1:
-            guessed[places[0]] = field
-    if "name" in guessed and "label" in guessed:
-        return guessed
-    return names if "name" in names else []
+    return _number_labels(path, read_rows(path, "label"))
 
 
 def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTable:
@@ -243,8 +147,7 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
             raise DataError(f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31")
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), split_called(split) or split)
-    if strange := sorted({row.split for row in rows.values()} - {*SPLITS, ""}):
-        log.warn(f"{path}: splits that are none of {', '.join(SPLITS)} stay as they are: {first_names(strange)}")
+    warn_of_splits(path, (row.split for row in rows.values()))
     return LabelTable(path, rows, class_names)
 
 

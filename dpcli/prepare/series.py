@@ -6,12 +6,14 @@ rule or by the pattern that a user gives; the others are named, and where no rul
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from os.path import splitext
 from pathlib import Path
+from unicodedata import normalize
 
 import numpy as np
 
@@ -113,12 +115,41 @@ def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
                 f"{name}: its frames are {series.described()}; left out: {first_names(series.left_out, _LISTED)}"
             )
         gaps = missing_numbers(series.numbers()) if series.times() is None else []
+        if order := _doubts_of_order(series):
+            lines.append(f"{name}: {order}")
         if gaps:
             lines.append(f"{name}: its frames are numbered with gaps: {first_names(gaps, _LISTED)} missing")
+    lines += _twice(clips)
     if moments := _moments([series for _, series in clips]):
         lines.append(moments)
     more = len(lines) - 2 * _LISTED
     return lines if more <= 0 else [*lines[: 2 * _LISTED], f"... and {more} more such folders"]
+
+
+def _doubts_of_order(series: Series) -> str:
+    """Returns what may be wrong with the order of frames: names that count nothing, or that hold two counts; "" if nothing."""
+    if len(series.names) < 2 or _counted_in_hex(series.names):
+        return ""
+    if not series.numbered:
+        return f"no number counts its frames; they are in the order of their names: {', '.join(series.names[:3])} ..."
+    names = parse_names(series.names)
+    found = _by_outer_numbers(names) if len({name.shape for name in names}) == 1 else None
+    clocks = found is not None and (_are_clocks(names) or series.times() is not None)
+    if found is None or clocks or not 1 < len(found[0]) < len(names) / 2:
+        return ""
+    return (
+        f"two numbers vary in the names of its frames ({series.pattern}); all {len(names)} are taken as one sequence, not the"
+        f" {len(found[0])} that begin as {found[0][0][0].text} and {found[0][1][0].text} do (--pattern takes one)"
+    )
+
+
+def _twice(clips: Sequence[tuple[str, Series]]) -> list[str]:
+    """Returns a line for the log where several samples are the same files, to which links lead."""
+    places: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for name, series in clips:
+        places.setdefault((os.path.realpath(series.folder), series.names), []).append(name)
+    same = [names for names in places.values() if len(names) > 1]
+    return [f"{' and '.join(same[0][:3])} are the same files by a link: samples that are there twice"] if same else []
 
 
 def _moments(clips: Sequence[Series]) -> str:
@@ -164,35 +195,65 @@ def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
     if len(groups) > 1 and (hexadecimal := _counted_in_hex(names)):
         suffix = splitext(names[0])[1].lower()
         return [Series(folder, tuple(hexadecimal), f"*{suffix}", numbered=False, suffix=suffix)]
-    found = [_made(folder, part) for group in groups.values() for part in _objects(group)]
+    apart = [part for group in groups.values() for part in _spelled_apart(group)]
+    found = [_made(folder, part) for group in apart for part in _objects(group)]
     scattered = sum(len(one.names) for one in found if one.numbered and len(one.names) == 1)
     if scattered > 2 and 2 * scattered > sum(len(one.names) for one in found if one.numbered):
         found = _joined(folder, found)  # such as hashes: their letters are no pattern
     return sorted(found, key=lambda one: (-len(one.names), one.names))
 
 
-def _objects(group: list[Name]) -> list[list[Name]]:
-    """Returns the files of one shape by object, where each object's frames are counted anew, such as ``cup1_0, cup1_1,
-    cup2_0, cup2_1``, or where several have the same times.
+def _spelled_apart(group: list[Name]) -> list[list[Name]]:
+    """Returns the files of one shape, by their spelling where two have the same numbers, such as ``Frame_1`` and ``frame_1``."""
+    if len({name.numbers for name in group}) == len(group) or not group[0].numbers:
+        return [group]
+    spellings: dict[tuple[str, ...], list[Name]] = {}
+    for name in group:
+        spellings.setdefault((*name.parts, splitext(name.text)[1]), []).append(name)
+    return list(spellings.values())
+
+
+def _by_outer_numbers(group: list[Name]) -> tuple[list[list[Name]], int, bool] | None:
+    """Returns the files of one shape by all of their varying numbers but one, that one's place, and whether it tells times;
+    None where one number varies, or several tell times. The number left out is the one that tells times, else the last.
     """
     columns = NumberColumns(group)
     varying = columns.varying()
     timed = [column for column in varying if columns.tells_times(column)]
     if len(varying) < 2 or len(timed) > 1:
-        return [group]
+        return None
     inner = timed[0] if timed else varying[-1]
-    outer = [column for column in varying if column != inner]
     parts: dict[tuple[str, ...], list[Name]] = {}
     for name in group:
-        parts.setdefault(tuple(name.numbers[column] for column in outer), []).append(name)
-    counts = [sorted(float(name.numbers[inner]) for name in part) for part in parts.values()]
+        parts.setdefault(tuple(name.numbers[column] for column in varying if column != inner), []).append(name)
+    return list(parts.values()), inner, bool(timed)
+
+
+def _objects(group: list[Name]) -> list[list[Name]]:
+    """Returns the files of one shape by object, where each object's frames are counted anew, such as ``cup1_0, cup1_1,
+    cup2_0, cup2_1``, where several have the same times, or where their counts overlap.
+    """
+    found = _by_outer_numbers(group)
+    if found is None:
+        return [group]
+    parts, inner, timed = found
+    counts = [sorted(float(name.numbers[inner]) for name in part) for part in parts]
     several = len(parts) > 1 and all(len(own) > 1 for own in counts)
     if timed:
-        fractions = all(len(name.numbers[column]) in (6, 9) for name in group for column in outer)  # of the seconds
-        return list(parts.values()) if several and not fractions else [group]
+        apart = [k for k in range(len(group[0].numbers)) if k != inner and len({name.numbers[k] for name in group}) > 1]
+        fractions = all(len(name.numbers[k]) in (6, 9) for name in group for k in apart)  # of the seconds
+        return parts if several and not fractions else [group]
     anew = all(own == [counts[0][0] + k for k in range(len(own))] for own in counts)
     alike = all(own == counts[0] for own in counts) and counts[0][-1] >= _SIXTY
-    return list(parts.values()) if several and (anew or alike) else [group]
+    ends = sorted((own[0], own[-1]) for own in counts)
+    overlap = any(after[0] <= before[1] for before, after in zip(ends, ends[1:])) and not _are_clocks(group)
+    return parts if several and (anew or alike or overlap) else [group]
+
+
+def _are_clocks(group: list[Name]) -> bool:
+    """Returns whether all numbers of the names that vary are of two digits below 60, as minutes and seconds are."""
+    varying = NumberColumns(group).varying()
+    return all(len(name.numbers[k]) == 2 and name.numbers[k] < "60" for name in group for k in varying)
 
 
 def _made(folder: Path, names: list[Name]) -> Series:
@@ -301,7 +362,7 @@ def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:
         if len(same) == 1:
             joined += same
             continue
-        stems = [stem for one in same for stem in one.stems]
+        stems = [normalize("NFC", stem).casefold() for one in same for stem in one.stems]
         texts = {one.suffix in TEXTS for one in same}
         if same[0].numbered and len(set(stems)) == len(stems) and len(texts) == 1:
             joined.append(_made_of(folder, same))

@@ -99,6 +99,7 @@ def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
     """
     own = f".{os.getpid()}" if many_writers else ""
     part = path.with_name(f".{path.name}{own}.part{path.suffix}")
+    check_regular(path)
     _remove(part)  # a killed run may have left it
     try:
         yield part
@@ -164,6 +165,8 @@ def check_writable(path: Path, option: str = "-o") -> None:
 
 def make_folder(folder: Path, option: str = "-o") -> None:
     """Makes a folder and those above it; nothing where it exists. Raises DataError, or DiskFull, where it can't be made."""
+    if str(folder) == "-":
+        check_regular(folder, option)
     refuse_broken_link(folder, option)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -183,7 +186,11 @@ def refuse_broken_link(folder: Path, option: str = "-o") -> None:
 
 
 def check_regular(path: Path, option: str = "-o") -> None:
-    """Raises UsageError where a device, pipe or socket is, or a handle such as /dev/stdout."""
+    """Raises UsageError where a device, pipe or socket is, or a handle such as /dev/stdout; also for ``-``, a pipe where files go
+    through one, which would else become a file or folder of that name.
+    """
+    if str(path) == "-":
+        raise UsageError(f"{option} -: goes through no pipe here; name a file or folder")
     target = os.readlink(path) if path.is_symlink() else ""
     handle = target.startswith("/proc/") or os.path.realpath(path.parent).startswith("/proc/")
     if handle or (path.exists() and not path.is_file() and not path.is_dir()):

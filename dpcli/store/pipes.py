@@ -48,7 +48,11 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
             shutil.copyfileobj(stream, spool, _PIECE)
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
-        yield path
+        try:
+            yield path
+        except DataError as error:  # the copy is gone when somebody reads the message
+            said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), "stdin")
+            raise DataError(said) from error.__cause__
 
 
 @contextmanager

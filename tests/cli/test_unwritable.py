@@ -17,11 +17,11 @@ from dpcli.errors import DataError
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.weights import find_weights
 from dpcli.runtime.whole_file import DiskFull
-from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.pipes import check_output
 from dpcli.store.writing.journal import Journal
 from tests.support.commands import exit_code
-from tests.support.prepare_helpers import ROOT
+from tests.support.prepare_helpers import ROOT, dpc
 
 COMMANDS = [
     "prepare clouds raw -o ro/a.h5",
@@ -287,3 +287,38 @@ def test_an_input_that_nobody_may_read_is_bad_data_everywhere(words, tmp_path, m
 
     monkeypatch.setattr("builtins.open", refused)
     assert exit_code(*words.split()) == 3 and "R: permission denied" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("segment predict own.h5 -o parts.h5 --ply -", "--ply"),
+        ("info own.h5 --page -", "--page"),
+        ("segment joints parts.h5 -o joints.h5 --picture -", "--picture"),
+        ("generate4d render scene.h5 -o turn.gif --picture -", "--picture"),
+        ("classify train own.h5 --preset tiny -o -", "-o"),
+    ],
+)
+def test_what_goes_through_no_pipe_becomes_no_file_of_that_name(tmp_path, monkeypatch, capsys, words, option):
+    monkeypatch.chdir(tmp_path)
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b"]) as writer:
+        for k in range(4):
+            frame = np.random.default_rng(k).normal(size=(20, 3)).astype(np.float32)
+            writer.write(CloudSequence.from_frames(f"s{k}", [frame, frame], label=k % 2, split="train", subject=k))
+    assert exit_code(*words.split()) == 2
+    assert f"{option} -: goes through no pipe here" in capsys.readouterr().err
+    assert not (tmp_path / "-").exists()
+
+
+def test_merge_and_split_go_through_pipes(tmp_path):
+    for k in range(2):
+        with CloudsWriter(tmp_path / f"{k}.h5", class_names=["a"]) as writer:
+            for number in range(3):
+                frame = np.random.default_rng(number).normal(size=(5, 3)).astype(np.float32)
+                writer.write(CloudSequence.from_frames(f"{k}-{number}", [frame], label=0, split=("train", "test")[k]))
+    first, second = tmp_path / "0.h5", tmp_path / "1.h5"
+    joined = dpc("prepare", "merge", "-", second, "-o", "-", input=first.read_bytes(), text=False).stdout
+    divided = dpc("prepare", "split", "-", "-o", "-", "--fractions", "0,0,1", input=joined, text=False).stdout
+    (tmp_path / "whole.h5").write_bytes(divided)
+    with CloudsReader(tmp_path / "whole.h5") as reader:
+        assert len(reader) == 6 and set(reader.splits) == {"test"}

@@ -13,11 +13,11 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import _read_image
+from dpcli.prepare.array_files.safe_pickle import read_npz_member
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.decode.color_frames import read_rgba
 from dpcli.prepare.decode.depth_files import read_array, read_image
 from dpcli.prepare.decode.npz_frames import read_frames
-from dpcli.prepare.decode.safe_pickle import read_npz_member
 from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.animations import animation_times
 

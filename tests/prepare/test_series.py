@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -198,3 +199,47 @@ def test_the_name_that_says_depth_is_taken_and_the_color_named():
         series = choose_series(Path("clip"), names + again, wanted=r"^(?!.*vis).*depth")
         assert len(series.names) == 2 and all("depth" in name for name in series.names)
         assert len(series.left_out) == len(names) - 1
+
+
+@pytest.mark.parametrize("form", ("take{}_{:03d}.ply", "{}/{:d}", "rec-{}-frame-{:04d}.pcd"))
+@pytest.mark.parametrize("firsts", ((0, 3), (2, 5, 7), (1, 1, 4)))
+def test_counts_that_overlap_are_several_series(tmp_path, form, firsts):
+    names = [form.replace("/", "+").format(k, first + t) for k, first in enumerate(firsts) for t in range(5 + k)]
+    with pytest.raises(DataError, match=f"holds {len(firsts)} series"):
+        choose_series(tmp_path, names)
+
+
+def test_counts_that_go_on_are_one_series_of_which_the_log_tells_two_numbers(tmp_path):
+    names = [f"seq{k}_{t:03d}.ply" for k, some in enumerate((range(5), range(5, 12), range(14, 18))) for t in some]
+    series = choose_series(tmp_path, names)
+    assert len(series.names) == 16
+    assert any("two numbers vary" in line and "not the 3" in line for line in about_series([("a", series)]))
+
+
+def test_minutes_and_seconds_are_one_count(tmp_path):
+    names = [f"{k // 60:02d}_{k % 60:02d}.ply" for k in range(630, 730, 7)]
+    series = choose_series(tmp_path, names[::-1])
+    assert list(series.names) == names and about_series([("a", series)]) == []
+
+
+@pytest.mark.parametrize("pair", (("Frame_", "frame_"), ("Bänd_", unicodedata.normalize("NFD", "Bänd_"))))
+def test_names_that_differ_in_spelling_alone_are_one_count_unless_numbers_come_twice(tmp_path, pair):
+    names = [f"{pair[t % 2]}{t:02d}.ply" for t in range(12)]
+    assert list(choose_series(tmp_path, sorted(names)).names) == names
+    with pytest.raises(DataError, match="holds 2 series"):
+        choose_series(tmp_path, [f"{one}{t}.ply" for one in pair for t in range(4)])
+
+
+def test_an_order_that_no_number_tells_is_told(tmp_path):
+    words = choose_series(tmp_path, ["first.ply", "second.ply", "third.ply"])
+    assert "no number counts its frames" in about_series([("a", words)])[0]
+    assert about_series([("a", choose_series(tmp_path, ["a1.ply", "a2.ply"]))]) == []
+    hexadecimal = [f"{number:02x}.ply" for number in range(20)]
+    assert about_series([("a", choose_series(tmp_path, hexadecimal))]) == []
+
+
+def test_a_link_to_another_sample_is_told(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "latest").symlink_to("a")
+    twice = [(name, choose_series(tmp_path / name, ["0.ply", "1.ply"])) for name in ("a", "latest")]
+    assert about_series(twice) == ["a and latest are the same files by a link: samples that are there twice"]

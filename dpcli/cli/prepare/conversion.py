@@ -56,6 +56,9 @@ def run_conversion(
     name: the command's, which is also its recipe's. raw: the folder that `--check` compares with the recipe.
     """
 
+    if str(raw) == "-":
+        raise UsageError("-: raw data come from files and folders, not through a pipe; name them")
+
     def made() -> Any:
         with reading(raw or f"prepare {name}"):  # some look into the folder to choose how it is read
             return make_reader()

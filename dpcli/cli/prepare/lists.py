@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 from dpcli.errors import UsageError
 
 
@@ -26,10 +28,18 @@ def whole_numbers(text: str, option: str) -> tuple[int, ...]:
         raise UsageError(f"{option} {text}: expected whole numbers with commas, such as 1,2,3") from None
 
 
+def _finite(text: str) -> tuple[float, ...]:
+    """Returns the numbers of a list. Raises ValueError for anything else, NaN and infinity too, which pass all comparisons."""
+    numbers = tuple(float(word) for word in words(text))
+    if not all(map(isfinite, numbers)):
+        raise ValueError(text)
+    return numbers
+
+
 def degrees(text: str, option: str) -> tuple[float, ...]:
     """Returns the angles of a list, in degrees. Raises UsageError, which names the option, for anything else."""
     try:
-        return tuple(float(word) for word in words(text))
+        return _finite(text)
     except ValueError:
         raise UsageError(f"{option} {text}: expected degrees with commas, such as 15,-75") from None
 
@@ -43,7 +53,7 @@ def three_shares(text: str) -> tuple[float, float, float]:
     (0.8, 0.1, 0.1)
     """
     try:
-        train, validation, test = (float(word) for word in words(text))
+        train, validation, test = _finite(text)
     except ValueError:
         raise UsageError(f"--fractions {text}: expected three numbers, such as 0.8,0.1,0.1") from None
     return train, validation, test

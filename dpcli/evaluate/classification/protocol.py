@@ -19,6 +19,7 @@ from dpcli.evaluate.classification.metrics import (
 )
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
 from dpcli.evaluate.results import LeftOut, counted_split, tell_split
+from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader
 
 FUSED = "fused"  # the file's main scores, when it also holds those of single streams
@@ -83,6 +84,7 @@ def evaluate_classification(
     split = counted_split(split, found.splits)
     keep, left_out = _choose_samples(scores, found, split)
     labels = found.labels[keep]
+    _tell_first_label(truth or path, scores.scores[keep], labels)
     streams = {name: rows[keep] for name, rows in _streams(scores).items()}
     return ClassificationReport(
         class_names=scores.class_names,
@@ -101,6 +103,21 @@ def evaluate_classification(
         rejected=None if scores.rejected is None else scores.rejected[keep],
         calibration={name: calibrate(rows, labels) for name, rows in streams.items()},
     )
+
+
+def _tell_first_label(where: str | Path, scores: np.ndarray, labels: np.ndarray) -> None:
+    """Warns where labels (S) that are all one lower or higher would fit the scores (S,C) far better, as where one side counts
+    from 1 and the other from 0, and a class at the end that nobody has hides it.
+    """
+    best = scores.argmax(1)
+    right = int(np.count_nonzero(best == labels))
+    for step, free in ((-1, labels.min() > 0), (1, labels.max() < scores.shape[1] - 1)):
+        moved = int(np.count_nonzero(best == labels + step))
+        if free and moved - right > 3 * (moved + right) ** 0.5:
+            log.warn(
+                f"{where}: {moved} of {len(labels)} samples would be right if all labels were one {'lower' if step < 0 else 'higher'},"
+                f" {right} are as they stand; does one side count classes from 1? Labels count from 0"
+            )
 
 
 def _metric(scores: np.ndarray, labels: np.ndarray) -> WeightedMetric:

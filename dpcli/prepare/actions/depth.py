@@ -25,6 +25,8 @@ from dpcli.prepare.actions.depth_units import (
     usual_scale,
     without_marks,
 )
+from dpcli.prepare.array_files.containers import made_by_dpc
+from dpcli.prepare.array_files.depth_arrays import says_depth
 from dpcli.prepare.decode.depth_files import (
     ARRAY_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -32,7 +34,6 @@ from dpcli.prepare.decode.depth_files import (
     frame_series,
     read_depth_video,
     require_depth,
-    says_depth,
 )
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -51,12 +52,12 @@ DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of 
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
     r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
-    r"|infra|thermal|reflect|ambient|uncertain|varianc|fisheye|skelet|temperature|active_?brightness"
+    r"|infra|thermal|reflect|ambient|uncertain|varianc|fisheye|skelet|inerti|temperature|active_?brightness"
     r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
 _FOREIGN = tuple(  # that may hold depth, and are not read
-    ".mat .h5 .hdf5 .gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
+    ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
     " .svo2 .r3d .sens .xef .klg .dat .pkl".split()
 )
 _HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
@@ -339,7 +340,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))
-        found += [(file, None) for file in named if file.is_file()]
+        found += [(file, None) for file in named if file.is_file() and not made_by_dpc(file)]
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import first_names
-from dpcli.prepare.actions.mat5 import read_mat5
+from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder

@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import open_archive
-from dpcli.prepare.decode.safe_pickle import read_npz_member
+from dpcli.prepare.array_files.safe_pickle import read_npz_member
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_json

@@ -9,6 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
+from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -35,7 +36,19 @@ def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
-    arrays = read_arrays(path)
+    return _cloud_of_arrays(path, read_arrays(path), keep)
+
+
+def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads a MATLAB file of one cloud as `read_npz` reads its arrays."""
+    with open_arrays(path) as arrays:
+        plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
+    return _cloud_of_arrays(
+        path, {name: one.reshape(-1) if 1 in one.shape else one for name, one in plain.items()}, keep
+    )
+
+
+def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[str]) -> Cloud:
     key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
     if key is None and {"x", "y", "z"} <= arrays.keys():
         return cloud_of_columns(path, {k: a for k, a in arrays.items() if a.shape == arrays["x"].shape}, keep)
@@ -71,6 +84,10 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         return cloud_of_columns(path, {name: flat[name] for name in array.dtype.names}, keep)
     if keep:
         raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
+    if array.shape == (0,):  # of an empty list of points
+        return Cloud(np.zeros((0, 3), np.float32))
+    if array.ndim == 3 and array.shape[0] == 1:  # a batch of one
+        array = array[0]
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "uif":
         several = "; of several frames save a file for each, of a cloud in rows and columns its reshape(-1, 3)"
         hint = several if array.ndim == 3 else ""

@@ -31,7 +31,13 @@ _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height"
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")
 _TOLD = re.compile(
-    r"\b(?:unit|units|coordinates|lengths)\b(?:\s*[:=]\s*|\s+(?:are\s+|is\s+)?(?:in\s+)?)([a-z]+)\b", re.IGNORECASE
+    r"(?:\b|_)(?:units?|coordinates|lengths)\b(?:\s*[:=]\s*|\s+(?:are\s+|is\s+)?(?:in\s+)?)(?:1\s+)?[\[(]?([a-z]+)\b",
+    re.IGNORECASE,
+)
+_IN_WORDS = re.compile(  # "x, y, z in mm", but no "resolution in mm"
+    r"^[^a-z]*(?:(?:comment|obj_info|all|the|values|points?|positions?|vertices|vertex|data|are|is|given|stored|measured|x|y|z|xyz"
+    r"|and)\b[^a-z]*)+\bin\s+[\[(]?([a-z]+)\b",
+    re.IGNORECASE,
 )
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
 _FRAME = re.compile(
@@ -90,8 +96,11 @@ def unit_of_comments(lines: Iterable[str]) -> str:
 
     >>> unit_of_comments(["comment made by hand", "obj_info units = mm"]), unit_of_comments(["# unit: none"])
     ('mm', '')
+    >>> unit_of_comments(["comment x, y, z in mm"]), unit_of_comments(["comment accuracy of points in mm"])
+    ('mm', '')
     """
-    told = {_SPELLED.get(match[1].lower(), "") for line in lines if (match := _TOLD.search(line))} - {""}
+    found = [_TOLD.search(line) or _IN_WORDS.search(line) for line in lines]
+    told = {_SPELLED.get(match[1].lower(), "") for match in found if match} - {""}
     return told.pop() if len(told) == 1 else ""
 
 

@@ -340,9 +340,24 @@ def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None)
     if not all(
         re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
     ):
-        words = ", ".join(_names(line, delimiter) or line.split())[:80]
-        raise DataError(f"{path}:{number}: columns {words}; expected x, y and z among them, or numbers only")
+        words = _names(line, delimiter) or line.split()
+        raise DataError(
+            f"{path}:{number}: columns {', '.join(words)[:80]}; expected x, y and z among them, or numbers only{_advice(words)}"
+        )
     return number, []
+
+
+def _advice(words: list[str]) -> str:
+    """Returns what to do where columns tell angles instead of lengths, "" where they don't."""
+    known = {word.lower()[:3] for word in words}
+    if {"lat", "lon"} <= known:
+        return "; project latitudes and longitudes to meters first"
+    angles = known & {"azi", "ele", "the", "phi", "ang"}
+    return (
+        "; compute x, y and z of the angles and distances first"
+        if angles and known & {"ran", "dis", "r", "rho", "dep"}
+        else ""
+    )
 
 
 def _names(line: str, delimiter: str | None) -> list[str]:

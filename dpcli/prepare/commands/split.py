@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.copy_samples import Copy, copy_samples
 from dpcli.prepare.commands.sources import Source, read_source
+from dpcli.prepare.name_tables import places_of, read_rows, warn_of_splits
 from dpcli.prepare.reader import SPLITS, split_called
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -46,7 +46,7 @@ class SplitChoice:
             raise UsageError("--list, --subjects and --fractions were given together; use one")
         if self.fractions is not None:
             low, total = min(self.fractions), sum(self.fractions)
-            if low < 0 or abs(total - 1) > 1e-6:
+            if not (low >= 0 and abs(total - 1) <= 1e-6):  # NaN, too
                 raise UsageError(f"--fractions {self.fractions}: expected three numbers from 0 that sum to 1")
 
     def assign(self, source: Source, splits: Sequence[str], subjects: Sequence[int]) -> list[str]:
@@ -70,27 +70,13 @@ class SplitChoice:
 
 
 def splits_by_list(source: Source, path: Path) -> list[str]:
-    """Returns splits from a CSV of name,split, with or without that header, those of ours in any spelling; names of samples
-    that are not there are an error.
+    """Returns splits from a table of name,split as `read_rows` reads it, with or without that header, those of ours in any
+    spelling. Raises DataError for names of samples that are not there.
     """
-    try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; expected lines name,split") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a CSV table ({error}); expected lines name,split") from None
-    chosen: dict[str, str] = {}
-    for number, row in enumerate(rows, 1):
-        if [cell.lower() for cell in row[:2]] == ["name", "split"] and number == 1:
-            continue
-        if len(row) != 2 or not all(row):
-            raise DataError(f"{path}, line {number}: found {','.join(row)!r}, expected name,split")
-        if row[0] in chosen:
-            raise DataError(f"{path}, line {number}: {row[0]!r} is listed twice")
-        chosen[row[0]] = split_called(row[1]) or row[1]
-    unknown = [name for name in chosen if name not in set(source.names)]
-    if unknown:
-        raise DataError(f"{path}: {len(unknown)} names are not in {source.path}, the first is {unknown[0]!r}")
+    rows = read_rows(path, "split")
+    places = places_of(path, rows, source.names)
+    chosen = {places[written]: split_called(row["split"]) or row["split"] for written, row in rows.items()}
+    warn_of_splits(path, chosen.values())
     return [chosen.get(name, "") for name in source.names]
 
 

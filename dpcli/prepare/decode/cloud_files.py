@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_npy, read_npz
+from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_mat, read_npy, read_npz
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.gaussians import read_splat, read_spz
 from dpcli.prepare.cloud_formats.las import read_las
@@ -15,6 +15,7 @@ from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.decode.e57_files import read_e57
 from dpcli.runtime.clips.other_files import stand_in
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
@@ -38,6 +39,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".xyzi": read_text,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".mat": read_mat,
+    ".e57": read_e57,
 }
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 

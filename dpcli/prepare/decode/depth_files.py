@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy, read_arrays
+from dpcli.npy_files import map_npy
 from dpcli.path_names import utf8_path
+from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, archived_depth, depth_frames, says_depth
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
@@ -27,10 +28,8 @@ if TYPE_CHECKING:
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
-ARRAY_SUFFIXES = (".npy", ".npz")
+ARRAY_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5")
 FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  # of two files of one frame the earlier is preferred
-# names that say depth, and not a picture of it or what lies beside it
-_DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
 _OTHERWISE = re.compile(r"disparit|(?<![a-z])disp(_?map)?(?![a-z])|(?<![a-z])inv(erse)?[-_ ]?depth", re.IGNORECASE)
 _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
@@ -42,12 +41,6 @@ _GRAY_NOISE, _COLORED_SHARE = (
 )  # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
-_SIZES = (  # (height, width) of depth cameras
-    *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
-    *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
-)
-_MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
-_LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
@@ -346,18 +339,7 @@ def frame_series(folder: Path, pattern: str = "") -> Series | None:
         arrays = sorted(name for name in names if not is_hidden(name))
         if len(arrays) < 2 or not _is_frame(folder / arrays[0]):
             return None
-    return choose_series(
-        folder, names, pattern=pattern, suffixes=FRAME_SUFFIXES, wanted=_DEPTH_NAME, judge=_holds_depth
-    )
-
-
-def says_depth(name: str) -> bool:
-    """Returns whether a name without suffix says that its pictures are depth, and no picture of depth.
-
-    >>> says_depth("lowres_depth"), says_depth("depth_vis"), says_depth("anna_1")
-    (True, False, False)
-    """
-    return re.search(_DEPTH_NAME, name, re.IGNORECASE) is not None
+    return choose_series(folder, names, pattern=pattern, suffixes=FRAME_SUFFIXES, wanted=DEPTH_NAME, judge=_holds_depth)
 
 
 def require_depth(path: Path, name: str) -> None:
@@ -397,48 +379,12 @@ def _holds_depth(path: Path) -> bool:
 
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
-    """Reads depth frames (T,H,W), or one frame (H,W), of a ``.npy``, mapped so that a stride reads less, or of a ``.npz``.
+    """Reads depth frames (T,H,W), or one frame (H,W), of a ``.npy``, mapped so that a stride reads less, or of a file of
+    named arrays; those of MATLAB are (H,W,T).
 
     Raises DataError of what is none, such as the poses of a camera.
     """
-    return _as_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else _archived(path)[0], stride)
-
-
-def _as_frames(path: Path, array: np.ndarray, stride: int = 1) -> np.ndarray:
-    if array.ndim == 2 or array.ndim == 3 and array.shape[2] == 1:  # no picture is one pixel wide
-        array = array.reshape(1, *array.shape[:2])
-    if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
-        array = array[..., 0] if array.shape[3] == 1 else array[:, 0]
-    if array.ndim != 3 or array.dtype.kind not in "uif":
-        raise DataError(
-            f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
-        )
-    _require_frames_first(path, array.shape)
-    if array.shape[1:] in _MATRICES and _are_matrices(array):
-        raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
-    return np.ascontiguousarray(array[::stride])
-
-
-def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
-    """Raises DataError of a shape whose last axis seems to count frames: its first two are a camera's, or the last is tiny."""
-    *first, last = shape
-    usual = tuple(first) in _SIZES and (first[1], last) not in _SIZES and (last, first[1]) not in _SIZES
-    if usual or (min(first) >= _LEAST and min(first) >= _TALL * last):
-        raise DataError(
-            f"{path}: array of shape {shape}; expected (frames, height, width): if its last axis counts the frames, save"
-            " numpy.moveaxis(array, -1, 0)"
-        )
-
-
-def _archived(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions, and the others."""
-    arrays = read_arrays(path)
-    called = [k for k, v in arrays.items() if says_depth(k) and v.ndim > 1 and v.shape not in _MATRICES]
-    shaped = [key for key, array in arrays.items() if array.ndim in (2, 3) and array.dtype.kind in "uif"]
-    chosen = next((choice[0] for choice in (called, shaped) if len(choice) == 1), None)
-    if chosen is None:
-        raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called depth")
-    return arrays.pop(chosen), arrays
+    return depth_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else archived_depth(path)[0], stride)
 
 
 def _told_beside(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -446,16 +392,8 @@ def _told_beside(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     from dpcli.prepare.decode.calibration import camera_of_arrays
 
     camera, scale, unread = camera_of_arrays(path, arrays)
-    notes = {f"videos whose .npz holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
+    notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
     return {"camera": camera, "scale": scale, "notes": notes}
-
-
-def _are_matrices(array: np.ndarray) -> bool:
-    """Returns whether each of some 3x3, 3x4 or 4x4 numbers turns, or projects as a pinhole camera does."""
-    first = array[:, :3, :3].astype(np.float64)
-    turns = np.allclose(first @ first.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-    projects = (first[:, 2] == (0, 0, 1)).all() and not first[:, (0, 1), (1, 0)].any()
-    return bool(turns or projects)
 
 
 def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
@@ -472,7 +410,7 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         first = series.paths[0]
         white = first.suffix.lower() in (".tif", ".tiff") and has_white_at_zero(first.read_bytes())
         told: dict[str, Any] = {"notes": {WHITE_AT_ZERO: 1} if white else {}}
-        told = _told_beside(first, _archived(first)[1]) if first.suffix.lower() == ".npz" else told
+        told = _told_beside(first, archived_depth(first)[1]) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
         video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], **told)
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         try:
@@ -488,9 +426,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
 
 def _read_file(path: Path, stride: int) -> DepthVideo:
     """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
-    if path.suffix.lower() == ".npz":
-        array, others = _archived(path)
-        return DepthVideo(_as_frames(path, array, stride), **_told_beside(path, others))
+    if path.suffix.lower() in ARRAY_SUFFIXES[1:]:
+        array, others = archived_depth(path)
+        return DepthVideo(depth_frames(path, array, stride), **_told_beside(path, others))
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
     frames, time, missing = read_timed_video(path, stride)

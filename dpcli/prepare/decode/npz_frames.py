@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import open_archive, read_member, require_room
-from dpcli.prepare.decode.safe_pickle import load_arrays
+from dpcli.prepare.array_files.safe_pickle import load_arrays
 
 
 def member_names(path: Path) -> list[str]:

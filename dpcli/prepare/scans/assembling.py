@@ -19,6 +19,7 @@ from dpcli.store.schema import kept_name
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
+_NEAREST = 300.0  # meters from a sensor that are farther than any measures without measuring something before
 _COUNTED, _LOOKED_AT = 20.0, 1000  # meters from which on whole numbers alone are odd, and points that tell
 _DEGREES, _UPRIGHT = 0.01, 100.0  # sides as shares of how far away they lie; height as a multiple of them
 _COARSE = 0.01  # meters between neighboring float32 numbers, from which on a shape is lost
@@ -126,6 +127,9 @@ def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[
         return {"sequences more than 100 km wide; are they in meters? --scale N divides them": 1}
     if some is not None and widest > _COUNTED and farthest <= _FAR_AWAY and (some == np.floor(some)).all():
         return {"sequences in whole numbers, hardly meters; if they are millimeters, give --scale 1000": 1}
+    nearest = float((some.astype(np.float64) ** 2).sum(1).min()) ** 0.5 if some is not None else 0.0
+    if nearest > _NEAREST and widest <= _FAR_AWAY and farthest <= _FAR_AWAY:
+        return {"sequences without a point within 300 m of the origin; if these are millimeters, give --scale 1000": 1}
     if widest > _WIDE and farthest <= _FAR_AWAY:
         return {"sequences that reach 1 km around their sensor; if these are millimeters, give --scale 1000": 1}
     return {}

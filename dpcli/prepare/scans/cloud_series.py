@@ -15,7 +15,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
-from dpcli.prepare.series import TEXTS, Series, choose_series, is_hidden
+from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
 
 _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  # of two files of one frame
 
@@ -27,20 +27,21 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 )
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
-    ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
+    ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg"
-    " .bag .mcap .db3 .active .bz2 .xz .zst".split()
+    " .usd .usda .usdc .abc .blend .3ds"
+    " .bag .mcap .db3 .active .bz2 .xz .zst .tar .tgz".split()
 )
+_NOTES = (".json", ".yaml", ".yml", ".xml", ".toml")  # that may tell poses, times or labels
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
 _ADVICE = {
-    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst"), "unpack them"),
+    **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst", ".tar", ".tgz"), "unpack them"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
     ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
     **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
-    ".e57": "save their points as .ply, such as with CloudCompare",
 }
 
 
@@ -52,20 +53,23 @@ def find_sequences(
     suffixes: of point clouds. pattern: of the names of frames. table: a file that is no cloud, whatever its name. Raises
     DataError when there is none, or when a folder's clip must be chosen.
     """
-    found, poses, others = [], [], Counter[str]()
+    found, poses, others, alone = [], [], Counter[str](), []
     for folder, names, foreign in _folders(root, suffixes, table.resolve() if table else None):
-        others += foreign
+        others += Counter({suffix: count for suffix, count in foreign.items() if suffix not in _NOTES})
         series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED) if names else None
         if series and is_pose(series.paths[0]):
             poses.append(series)
         elif series:
             found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
+        else:
+            where = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
+            alone += [f"{where}{one}" for one in (*sorted(filter(is_beside, names)), *_counted(foreign))]
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
     return _without_logs(
-        root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses
+        root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses, alone
     )
 
 
@@ -76,11 +80,11 @@ def _of_pictures(root: Path) -> str:
     return f"; found {', '.join(_counted(found))}: if they hold depth, `dpc prepare depth` reads them" if found else ""
 
 
-def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[Series]:
+def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: list[str]) -> list[Series]:
     """Returns the sequences without the texts of folders such as KITTI's ``oxts``, one text above the folders of clouds, and
     arrays of normals, colors and the like; all of them where there is nothing else.
 
-    The first one names those as left out, and the poses that were found.
+    The first one names those as left out, the poses that were found, and ``alone``: what lies in folders without clouds.
     """
     scans = [one for one in found if one.suffix not in TEXTS]
 
@@ -97,7 +101,7 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[
     logs = [] if len(logs) == len(found) else logs
     first, *others = [one for one in found if one not in logs]
     named = sorted((one.folder / one.described()).relative_to(root).as_posix() for one in (*poses, *logs))
-    return [replace(first, left_out=(*first.left_out, *named)), *others]
+    return [replace(first, left_out=(*first.left_out, *named, *alone)), *others]
 
 
 def refuse_file(path: Path, suffixes: Sequence[str]) -> None:
@@ -126,7 +130,11 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        foreign = Counter(splitext(name)[1].lower() for name in names if name.lower().endswith(_FOREIGN))
+        foreign = Counter(
+            splitext(name)[1].lower()
+            for name in names
+            if name.lower().endswith((*_FOREIGN, *_NOTES)) and not is_hidden(name)
+        )
         if clouds or foreign:
             yield Path(folder), clouds, foreign
 

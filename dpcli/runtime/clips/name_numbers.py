@@ -12,6 +12,7 @@ from functools import lru_cache
 from os.path import splitext
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -55,8 +56,9 @@ class Name:
 
     @property
     def shape(self) -> str:
-        """Returns the name without suffix, in small letters, with ``*`` for every number."""
-        return "*".join(self.parts).casefold()
+        """Returns the name without suffix, in small letters that are composed alike, with ``*`` for every number."""
+        shape = "*".join(self.parts)
+        return (shape if shape.isascii() else normalize("NFC", shape)).casefold()
 
 
 def is_ticks(number: int) -> bool:

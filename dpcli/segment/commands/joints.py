@@ -10,7 +10,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.whole_file import make_folder, refuse_existing, whole_file
+from dpcli.runtime.whole_file import PICTURES, check_target, make_folder, refuse_existing, whole_file
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
@@ -32,6 +32,8 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
         refuse_existing(output, force)
     elif str(output) != "-" and output.exists() and not force:
         raise UsageError(f"{output}: exists already; --force replaces it")
+    if picture is not None:
+        check_target(picture, "--picture", PICTURES)
     with input_file(parts) as path, PartsReader(path) as reader:
         chosen = _chosen(reader, sequence)
         if output.suffix == ".urdf" and len(chosen) > 1:

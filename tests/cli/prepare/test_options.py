@@ -55,7 +55,9 @@ def test_lists():
     ):
         with pytest.raises(UsageError, match=message):
             read(text, "--x")
-    for text in ("1", "1,0", "1,0,0,0", "a,b,c", ""):
+        with pytest.raises(UsageError, match="--x 1,nan: expected"):
+            read("1,nan", "--x")  # which would pass all comparisons
+    for text in ("1", "1,0", "1,0,0,0", "a,b,c", "", "nan,0,0", "inf,0,0"):
         with pytest.raises(UsageError, match="expected three numbers, such as 0.8,0.1,0.1"):
             three_shares(text)
 

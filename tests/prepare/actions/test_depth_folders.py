@@ -150,8 +150,8 @@ def test_matrices_of_a_camera_are_no_depth(tmp_path, matrices):
 
 
 def test_files_that_are_not_read_are_named_where_nothing_else_is_there(tmp_path):
-    (tmp_path / "a.mat").write_bytes(b"MATLAB")
-    with pytest.raises(DataError, match="no depth video in it.*found 1 .mat: save their depth as 16-bit PNG"):
+    (tmp_path / "a.xef").write_bytes(b"EVENTS1")
+    with pytest.raises(DataError, match="no depth video in it.*found 1 .xef: save their depth as 16-bit PNG"):
         read(tmp_path)
 
 

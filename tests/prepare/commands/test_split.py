@@ -80,9 +80,9 @@ def test_by_list(whole, tmp_path):
     assert split(whole, tmp_path / "d", SplitChoice(listed=listed)) == {"train": 1, "": 9, "odd": 2}
     assert parts(tmp_path / "d") == {"odd": ["s03", "s07"], "train": ["s00"]}
     for text, message in (
-        ("s03,a\ns03,b\n", "line 2: 's03' is listed twice"),
-        ("s99,a\n", "1 names are not in .*all.h5, the first is 's99'"),
-        ("s03\n", "line 1: found 's03', expected name,split"),
+        ("s03,a\ns03,b\n", "list.csv:2: 's03' appears twice"),
+        ("s99,a\n", "names 's99', which is not among the samples"),
+        ("s03\n", "list.csv:1: 's03'; expected name,split"),
     ):
         listed.write_text(text)
         with pytest.raises(DataError, match=message):
@@ -90,6 +90,29 @@ def test_by_list(whole, tmp_path):
     listed.write_text("s03,../x\n")
     with pytest.raises(DataError, match="can't be a file name"):
         split(whole, tmp_path / "e", SplitChoice(listed=listed))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("divider", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["name*split", "s03*test", "s05.ply*Training"],
+        ["# Bänder", "split*name", "test*s03", "train*s05*"],
+        ["Name*label*Split", '"s03"*"wäve"*test', "# s07 was cut", "s05*push*train"],
+    ],
+)
+def test_a_list_in_any_dialect_of_tables(tmp_path, whole, encoding, divider, lines):
+    text = "\r\n".join(lines).replace("*", divider)
+    (tmp_path / "list.csv").write_bytes(text.encode(encoding))
+    expected = ["", "", "", "test", "", "train", *[""] * 6]
+    assert splits_by_list(read_source(whole), tmp_path / "list.csv") == expected
+
+
+def test_a_misspelled_split_is_told(tmp_path, whole, capsys):
+    (tmp_path / "list.csv").write_text("s03,trian\ns04,test\n")
+    splits_by_list(read_source(whole), tmp_path / "list.csv")
+    assert "stay as they are: trian" in capsys.readouterr().err
 
 
 def test_into_one_file_with_new_splits(whole, tmp_path):
@@ -181,10 +204,3 @@ def test_stopped_in_the_middle_it_goes_on_to_the_same_bytes(whole, tmp_path, mon
     assert sorted(path.name for path in (tmp_path / "twice").iterdir()) == ["test.h5", "train.h5"]
     for name in ("train.h5", "test.h5"):
         assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
-
-
-def test_a_list_in_another_encoding_is_named(tmp_path):
-    source = tmp_path / "list.csv"
-    source.write_bytes("name,split\nü,train\n".encode("utf-16"))
-    with pytest.raises(DataError, match="list.csv: cannot be read as a CSV table"):
-        splits_by_list(None, source)

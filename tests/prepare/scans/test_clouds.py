@@ -244,10 +244,10 @@ def test_a_missing_open3d_is_explained(monkeypatch):
 
 def test_what_else_lies_there_is_named(tmp_path):
     save(tmp_path / "a" / "0.ply")
-    (tmp_path / "a" / "0.e57").write_bytes(b"ASTM-E57")
+    (tmp_path / "a" / "0.obj").write_text("v 1 2 3\n")
     (tmp_path / "a" / "0.bag").write_bytes(b"#ROSBAG V2.0")
     reader = CloudFolders(tmp_path)
-    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .bag file, 1 .e57 file"
+    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .bag file, 1 .obj file"
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "0.bag.active").touch()
     with pytest.raises(DataError, match="found 1 .active file: end the recording, or repair it by `rosbag reindex`"):
@@ -255,7 +255,7 @@ def test_what_else_lies_there_is_named(tmp_path):
     for rest in ("a/0.bag", "b/0.bag.active"):
         (tmp_path / rest).unlink()
     (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
-    with pytest.raises(DataError, match="found 1 .e57 file, 1 .gz file: save their points as .ply, .*, or unpack them"):
+    with pytest.raises(DataError, match="found 1 .gz file, 1 .obj file: unpack them, or save their points as .ply"):
         CloudFolders(tmp_path).items()
     (tmp_path / "a.xlsx").write_bytes(b"PK")
     with pytest.raises(DataError, match="a.xlsx: .xlsx files are not read: save their sheets as .csv"):
@@ -352,3 +352,43 @@ def test_pictures_of_depth_are_sent_to_the_command_that_reads_them(tmp_path):
         (tmp_path / "v" / f"{k}.png").write_bytes(b"\x89PNG")
     with pytest.raises(DataError, match="found 3 .png files: if they hold depth, `dpc prepare depth` reads them"):
         find_sequences(tmp_path, (".ply",))
+
+
+@pytest.mark.parametrize("rest", ["poses.txt", "b/part.zip", "meta/ego_pose.json", "b/times.txt", "b/raw.tar"])
+def test_what_lies_in_folders_without_clouds_is_named(tmp_path, rest):
+    save(tmp_path / "velodyne" / "0.npy")
+    (tmp_path / rest).parent.mkdir(exist_ok=True)
+    (tmp_path / rest).write_text("1 2 3\n")
+    reader = CloudFolders(tmp_path)
+    assert [item.name for item in reader.items()] == ["velodyne"]
+    told = reader.summary(reader.items())[1].partition("left out: ")[2]
+    assert rest.rpartition("/")[0] in told and (rest in told or f"1 {rest[rest.index('.') :]} file" in told)
+
+
+@pytest.mark.parametrize(
+    ("at", "size", "told"), [(2100.7, 300, True), (600.3, 80, True), (2.1, 0.4, False), (40.0, 30, False)]
+)
+def test_millimeters_with_fractions_are_asked_for(tmp_path, at, size, told):
+    points = np.random.default_rng(1).uniform(-size, size, (200, 3)) + (0, 0, at)
+    np.save(tmp_path / "0.npy", points)
+    reader = CloudFolders(tmp_path)
+    notes = reader.read(reader.items()[0], np.random.default_rng(0)).notes
+    assert any("millimeters" in note for note in notes) == told
+
+
+def test_an_empty_list_of_points_is_a_frame_without_points(tmp_path):
+    for t, points in enumerate((np.ones((4, 3)), np.zeros(0), np.ones((5, 3)))):
+        np.save(tmp_path / f"{t}.npy", points + np.arange(points.size).reshape(points.shape))
+    reader = CloudFolders(tmp_path, fps=10)
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    assert sample.sequence.time.tolist() == [0.0, 0.2] and sample.notes == {"frames without points dropped": 1}
+
+
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [("lon,lat,alt", "project"), ("range,azimuth,elevation", "compute x, y and z"), ("a,b,c", "numbers only$")],
+)
+def test_angles_instead_of_lengths_are_told(tmp_path, header, told):
+    (tmp_path / "0.csv").write_text(f"{header}\n1,2,3\n")
+    with pytest.raises(DataError, match=told):
+        read_cloud(tmp_path / "0.csv")

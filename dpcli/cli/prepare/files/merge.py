@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -9,12 +10,15 @@ import typer
 
 from dpcli.cli.options import Force, Output
 from dpcli.cli.prepare.options import Compression
+from dpcli.errors import UsageError
 
 
 def merge(
     inputs: Annotated[
         list[Path],
-        typer.Argument(help="Files to join: all shards of one run (of prepare, predict ...), or any clouds."),
+        typer.Argument(
+            help="Files to join, one of them perhaps - for a pipe: all shards of one run (of prepare, predict ...), or any clouds."
+        ),
     ],
     output: Output,
     labels: Annotated[
@@ -35,12 +39,15 @@ def merge(
     """
     from dpcli.prepare.commands.merge import merge as merge_files
     from dpcli.prepare.label_map import LabelMap
-    from dpcli.store.pipes import output_file
+    from dpcli.store.pipes import input_file, output_file
 
+    if [str(one) for one in inputs].count("-") > 1:
+        raise UsageError("-: is given twice; only one file comes through a pipe")
     label_map = LabelMap.read(labels) if labels else None
-    with output_file(output) as path:
+    with ExitStack() as spooled, output_file(output) as path:
+        files = [spooled.enter_context(input_file(one)) if str(one) == "-" else one for one in inputs]
         report = merge_files(
-            inputs, path, labels=label_map, prefix=prefix, compression=compression, force=force, resume=output != "-"
+            files, path, labels=label_map, prefix=prefix, compression=compression, force=force, resume=output != "-"
         )
     if output != "-":
         typer.echo(f"{output}: {report.counts()}")

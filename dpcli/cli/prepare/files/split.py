@@ -58,9 +58,12 @@ class SplitOptions:
 
 
 def split(
-    clouds: Annotated[Path, typer.Argument(help="File of clouds.")],
+    clouds: Annotated[str, typer.Argument(help="File of clouds, or - for a pipe.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for train.h5, validation.h5, test.h5; or one FILE.h5.")
+        str,
+        typer.Option(
+            "-o", "--output", help="Folder for train.h5, validation.h5, test.h5; or one FILE.h5, or - for a pipe."
+        ),
     ],
     options: SplitOptions,
     compression: Compression = "none",
@@ -71,7 +74,9 @@ def split(
     For example: dpc prepare split own.h5 --fractions 0.8,0.1,0.1 -o own_split.h5
     """
     from dpcli.prepare.commands.split import split as split_file
+    from dpcli.store.pipes import input_file, output_file
 
-    counts = split_file(clouds, output, options.choice(), compression=compression, force=force)
-    for name, count in counts.items():
+    with input_file(clouds) as source, output_file(output) as target:
+        counts = split_file(source, target, options.choice(), compression=compression, force=force)
+    for name, count in counts.items() if output != "-" else ():
         typer.echo(printable(f"{name or 'in no split, left out'}: {count} sequences"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
@@ -13,6 +13,7 @@ from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 
 if TYPE_CHECKING:
+    from dpcli.prepare.scans.array_sequences import ArraySequences
     from dpcli.prepare.scans.clouds import CloudFolders
     from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TableSequences
@@ -28,6 +29,14 @@ class CloudUnits:
             "--bin-columns", help="float32 values per point of a .bin. Default: judged by the values, else 4."
         ),
     ] = None
+    axes: Annotated[
+        str,
+        typer.Option(
+            "--axes",
+            help="Axes of one array of many clouds: T frames, N points, C x y z, B sequences, as in TNC. Default: by shape and"
+            " values.",
+        ),
+    ] = ""
     scale: Annotated[
         float | None,
         typer.Option("--scale", help="Input units per unit of length in the output. Default: the files', else 1."),
@@ -47,6 +56,7 @@ class CloudUnits:
 class TableColumns:
     """Holds the options of tables whose rows are the points of many frames."""
 
+    HEADING: ClassVar[str] = "Tables"
     frame_column: Annotated[
         str, typer.Option("--frame-column", help="Column that numbers the frames of a table. Default: by its name.")
     ] = ""
@@ -63,7 +73,8 @@ def clouds(
     raw: Annotated[
         Path,
         typer.Argument(
-            help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; a table; or a recording."
+            help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; a table; an array of many"
+            " clouds (.npy .npz .h5 .mat); or a recording."
         ),
     ],
     units: CloudUnits,
@@ -105,10 +116,13 @@ def clouds(
 
 def _make_reader(
     raw: Path, units: CloudUnits, table: TableColumns, pattern: str, topic: str, shared: dict[str, Any]
-) -> CloudFolders | TableSequences | RecordedClouds:
-    """Returns the reader of recordings, of tables (those of a folder where an option says so), or of folders of frames."""
+) -> ArraySequences | CloudFolders | TableSequences | RecordedClouds:
+    """Returns the reader of recordings, of tables (those of a folder where an option says so), of arrays of many clouds, or of
+    folders of frames.
+    """
     from dpcli.prepare.decode.cloud_files import SUFFIXES
     from dpcli.prepare.recordings.recording import holds_only_recordings
+    from dpcli.prepare.scans.array_sequences import ArraySequences, holds_sequences
     from dpcli.prepare.scans.clouds import CloudFolders
     from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TABLES, TableSequences
@@ -117,4 +131,6 @@ def _make_reader(
         return RecordedClouds(raw, topic, **shared)
     if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
         return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
+    if units.axes or holds_sequences(raw, SUFFIXES):
+        return ArraySequences(raw, units.axes, pattern=pattern, **shared)
     return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)

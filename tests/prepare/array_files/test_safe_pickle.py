@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import pytest
 
-from dpcli.prepare.decode import safe_pickle
-from dpcli.prepare.decode.safe_pickle import load_arrays
+from dpcli.prepare.array_files import safe_pickle
+from dpcli.prepare.array_files.safe_pickle import load_arrays
 
 RNG = np.random.default_rng(0)
 HONEST = {
@@ -188,8 +188,8 @@ def test_names_of_the_allow_list_are_no_classes_and_take_no_state():
 _FUZZ = """
 import io, random, sys
 import numpy as np
-from dpcli.prepare.decode.safe_pickle import load_arrays
-from tests.prepare.decode.test_safe_pickle import mutants
+from dpcli.prepare.array_files.safe_pickle import load_arrays
+from tests.prepare.array_files.test_safe_pickle import mutants
 loaded = 0
 for mutant in mutants(int(sys.argv[1]), int(sys.argv[2])):
     try:

@@ -1,4 +1,4 @@
-"""MATLAB files of version 5, one array of numbers at a time, by the published layout (MathWorks, MAT-File Format).
+"""MATLAB files of version 5, arrays of numbers and cells of them, by the published layout (MathWorks, MAT-File Format).
 
 Every length is checked against the bytes that are there: compiled readers end the process at some damaged files.
 """
@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import PACKED_AT_MOST, ROOM
 
 _HEADER = 128
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # as stored
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}  # as meant
 _MATRIX, _COMPRESSED = 14, 15
+_CELL = 1  # of the classes
 _COMPLEX = 8  # flag
 _BEGIN = 4096  # bytes of a compressed array in which its name and shape are
 _MOST = 1 << 31  # bytes of one array
@@ -35,11 +37,8 @@ def read_mat5(path: Path, name: str) -> np.ndarray:
 
     Raises DataError when it is absent, something else, or damaged; also for files of version 4.
     """
-    data = path.read_bytes()
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:
-        raise DataError(f"{path}: not a MATLAB file of version 5 or 7.3, perhaps truncated; save it with -v7")
     found = []
+    data, order = _opened(path)
     try:
         for kind, content in _elements(data[_HEADER:], order):
             called, values = _variable(path, kind, content, order, name)
@@ -49,6 +48,15 @@ def read_mat5(path: Path, name: str) -> np.ndarray:
     except (_Damaged, zlib.error) as error:
         raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
     raise DataError(f"{path}: no variable {name!r}; found {found or 'none'}")
+
+
+def _opened(path: Path) -> tuple[bytes, str]:
+    """Returns the bytes of a file and their order. Raises DataError where it is none of version 5."""
+    data = path.read_bytes()
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise DataError(f"{path}: not a MATLAB file of version 5 or 7.3, perhaps truncated; save it with -v7")
+    return data, order
 
 
 def _elements(data: bytes, order: str) -> Iterator[Element]:
@@ -78,24 +86,75 @@ def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) ->
     flags, shape, name, used = _head(begin, order)
     if name != wanted:
         return name, None
-    dtype = np.dtype(order + _CLASSES.get(flags & 0xFF, "V0"))
-    if dtype.kind == "V" or flags >> 8 & _COMPLEX:
+    dtype = _type_of(flags, order)
+    if dtype is None:
         raise DataError(f"{path}: {wanted!r} is text, or of another type; expected numbers")
-    count = math.prod(shape)
-    if count * dtype.itemsize > _MOST:
-        raise _Damaged(f"{wanted!r} of shape {shape} takes more than {_MOST} bytes")
     if begin is not content:
-        content = zlib.decompressobj().decompress(content, 8 + used + 8 + 8 * count)
+        _require_room(dtype, shape, name)
+        content = zlib.decompressobj().decompress(content, 8 + used + 8 + 8 * math.prod(shape))
         content = memoryview(content)[8:]
-    stored, raw = next(_elements(memoryview(content)[used:], order), (0, b""))  # no copies: videos are large
+    return name, _numbers(memoryview(content)[used:], dtype, shape, name, order)
+
+
+def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
+    """Returns all variables that are arrays of real numbers, or cells of such arrays (as lists, column after column), by
+    name; others are passed over. Raises DataError as `read_mat5`, and where a file unpacks to far more than it has.
+    """
+    found: dict[str, np.ndarray | list[np.ndarray]] = {}
+    data, order = _opened(path)
+    left = ROOM + PACKED_AT_MOST * len(data)
+    try:
+        for kind, content in _elements(data[_HEADER:], order):
+            if kind == _COMPRESSED:
+                content = zlib.decompressobj().decompress(content, left + 1)
+                left -= len(content)
+                if left < 0:
+                    raise _Damaged(f"its variables claim more than {ROOM + PACKED_AT_MOST * len(data)} bytes")
+                kind, content = next(_elements(content, order), (0, b""))
+            if kind == _MATRIX:
+                name, values = _matrix(content, order)
+                found |= {name: values} if values is not None else {}
+    except (_Damaged, zlib.error) as error:
+        raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
+    return found
+
+
+def _matrix(content: bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarray] | None]:
+    """Returns name and values of a matrix, a list of those of a cell; None of what is neither numbers nor cells of them."""
+    flags, shape, name, used = _head(content, order)
+    rest = memoryview(content)[used:]
+    if flags & 0xFF == _CELL:
+        parts = [part for kind, part in _elements(rest, order) if kind == _MATRIX]
+        inside = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in parts]
+        plain = [one for one in inside if isinstance(one, np.ndarray)]
+        return name, plain if plain and len(plain) == len(inside) else None
+    dtype = _type_of(flags, order)
+    return name, None if dtype is None else _numbers(rest, dtype, shape, name, order)
+
+
+def _type_of(flags: int, order: str) -> np.dtype | None:
+    """Returns the type of a matrix of real numbers, None of any other."""
+    dtype = np.dtype(order + _CLASSES.get(flags & 0xFF, "V0"))
+    return None if dtype.kind == "V" or flags >> 8 & _COMPLEX else dtype
+
+
+def _require_room(dtype: np.dtype, shape: tuple[int, ...], name: str) -> None:
+    if math.prod(shape) * dtype.itemsize > _MOST:
+        raise _Damaged(f"{name!r} of shape {shape} takes more than {_MOST} bytes")
+
+
+def _numbers(content: memoryview, dtype: np.dtype, shape: tuple[int, ...], name: str, order: str) -> np.ndarray:
+    """Returns the values of a matrix, of which content is what follows its head."""
+    _require_room(dtype, shape, name)
+    stored, raw = next(_elements(content, order), (0, b""))  # no copies: videos are large
     if stored not in _NUMBERS:
-        raise _Damaged(f"{wanted!r} has no numbers")
+        raise _Damaged(f"{name!r} has no numbers")
     values = np.frombuffer(raw[: len(raw) - len(raw) % np.dtype(_NUMBERS[stored]).itemsize], order + _NUMBERS[stored])
-    if len(values) != count:
-        raise _Damaged(f"{wanted!r} of shape {shape} has {len(values)} numbers")
+    if len(values) != math.prod(shape):
+        raise _Damaged(f"{name!r} of shape {shape} has {len(values)} numbers")
     if dtype.kind == "f" and values.dtype.kind in "iu" and values.dtype.itemsize < dtype.itemsize:
         dtype = values.dtype  # MATLAB stores whole doubles in few bytes: the same numbers, a quarter of the memory
-    return name, values.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
+    return values.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
 
 
 def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
@@ -103,7 +162,7 @@ def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
     parts: list[Any] = []
     at = 0
     for _ in range(3):
-        tag = np.frombuffer(data[at : at + 8].ljust(8, b"\0"), order + "u4", 2).tolist()
+        tag = np.frombuffer(bytes(data[at : at + 8]).ljust(8, b"\0"), order + "u4", 2).tolist()
         size = 8 if tag[0] >> 16 else 8 + tag[1] + -tag[1] % 8
         parts.append(next(_elements(data[at : at + size], order), (0, b""))[1])
         at += size
@@ -113,4 +172,4 @@ def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
     sides = tuple(np.frombuffer(shape, order + "i4").tolist())
     if min(sides) < 0:
         raise _Damaged(f"a matrix of shape {sides}")
-    return int(np.frombuffer(flags, order + "u4", 1)[0]), sides, name.decode("latin1"), at
+    return int(np.frombuffer(flags, order + "u4", 1)[0]), sides, bytes(name).decode("latin1"), at

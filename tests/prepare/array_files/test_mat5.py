@@ -13,7 +13,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from dpcli.errors import DataError
-from dpcli.prepare.actions.mat5 import read_mat5
+from dpcli.prepare.array_files.mat5 import read_mat5
 from tests.support.prepare_helpers import dpc, write_msr
 
 RNG = np.random.default_rng(0)
@@ -90,8 +90,8 @@ _FUZZ = """
 import sys
 from pathlib import Path
 from dpcli.errors import DataError
-from dpcli.prepare.actions.mat5 import read_mat5
-from tests.prepare.actions.test_mat5 import mutants
+from dpcli.prepare.array_files.mat5 import read_mat5
+from tests.prepare.array_files.test_mat5 import mutants
 path, read = Path(sys.argv[1]), 0
 for mutant in mutants(path.parent, int(sys.argv[2])):
     path.write_bytes(mutant)

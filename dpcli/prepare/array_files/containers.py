@@ -1,0 +1,201 @@
+"""Files that hold named arrays: NumPy's, HDF5's and MATLAB's, opened so that what isn't asked for isn't read."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dpcli.errors import DataError, reading
+from dpcli.npy_files import map_npy, open_archive, read_member, require_room
+from dpcli.prepare.array_files.mat5 import read_variables
+from dpcli.prepare.array_files.safe_pickle import load_arrays
+
+if TYPE_CHECKING:
+    import h5py
+
+SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_MOST = 10_000  # data sets of a file that are looked at
+_FEW = 1 << 20  # elements of a list of arrays
+
+
+class Reversed:
+    """Shows a data set that MATLAB wrote with its axes in MATLAB's order; HDF5 has them the other way round."""
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset = dataset
+        self.shape: tuple[int, ...] = dataset.shape[::-1]
+        self.dtype: np.dtype = dataset.dtype
+        self.ndim = len(self.shape)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        places = key if isinstance(key, tuple) else (key,)
+        full = (*places, *[slice(None)] * (self.ndim - len(places)))
+        return np.asarray(self._dataset[full[::-1]]).T
+
+
+Array = Any  # np.ndarray, h5py.Dataset or Reversed: shape, dtype, ndim, and slices of it by []
+
+
+@contextmanager
+def open_arrays(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+    """Opens the arrays of numbers in a file by name ("" in a ``.npy``), each with ``shape``, ``dtype`` and slices, which alone
+    are read where the format allows it. A list, of an object array or a MATLAB cell, holds arrays of their own shapes.
+
+    Raises DataError when the file is damaged, a pickle of more than arrays, or one that dpc made.
+    """
+    if path.stat().st_size == 0:
+        raise DataError(f"{path}: the file is empty")
+    if is_hdf5(path):
+        with reading(path), _open_hdf5(path) as found:
+            yield found
+        return
+    facts = path.stat()
+    yield _read_all(path, facts.st_size, facts.st_mtime_ns)
+
+
+def is_hdf5(path: Path) -> bool:
+    """Returns whether a file is HDF5, as MATLAB 7.3 writes it too: by its first bytes, whatever its name."""
+    with path.open("rb") as file:
+        head = file.read(520)
+    return head.startswith(_HDF5) or head[512:520] == _HDF5
+
+
+def made_by_dpc(path: Path) -> bool:
+    """Returns whether a file is one of the contract, such as the output of an earlier conversion beside the raw data."""
+    import h5py
+
+    if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file() or not is_hdf5(path):
+        return False
+    try:
+        with h5py.File(path, "r") as file:
+            return "dpc_kind" in file.attrs
+    except OSError:
+        return False
+
+
+@contextmanager
+def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+    import h5py
+
+    from dpcli.store.file import refuse_claim
+    from dpcli.store.heap_check import check_heaps
+
+    check_heaps(path)
+    with h5py.File(path, "r") as file:
+        if "dpc_kind" in file.attrs:
+            raise DataError(
+                f"{path}: dpc made it; `dpc info {path}` says what it holds, and what comes next reads it as it is"
+            )
+        matlab = path.suffix.lower() == ".mat"
+        found: dict[str, Array | list[np.ndarray]] = {}
+        for name, item in _datasets(file, path):
+            refuse_claim(item, path)
+            if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
+                found |= {name: cells} if (cells := _cells(file, item, path)) else {}
+            elif item.dtype.kind in "uif" and item.ndim:
+                found[name] = Reversed(item) if matlab else item
+        yield found
+
+
+def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
+    """Returns the data sets in a file by name, each once; links to other files are not followed."""
+    import h5py
+
+    found: list[tuple[str, h5py.Dataset]] = []
+
+    def note(name: str, item: Any) -> None:
+        if len(found) > _MOST:
+            raise DataError(f"{path}: holds more than {_MOST} data sets; join those of one sequence")
+        if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # #refs#, the contents of MATLAB's cells
+            if item.is_virtual or item.external:
+                raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
+            found.append((name, item))
+
+    file.visititems(note)
+    return found
+
+
+def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> list[np.ndarray] | None:
+    """Returns the arrays of a MATLAB cell, column after column; None where it holds something else."""
+    import h5py
+
+    from dpcli.store.file import refuse_claim
+
+    if item.attrs.get("MATLAB_class") != b"cell":
+        return None
+    inside = [file[reference] for reference in item[()].reshape(-1)]
+    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" for one in inside):
+        return None
+    for one in inside:
+        refuse_claim(one, path)
+    return [np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else one[()].T for one in inside]
+
+
+@lru_cache(maxsize=1)  # an array holds many sequences; each process reads it once
+def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | list[np.ndarray]]:
+    if path.suffix.lower() == ".npy":
+        return {"": _npy(path)}
+    if path.suffix.lower() == ".mat":
+        return read_variables(path)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated")
+    with reading(path), open_archive(path) as archive:
+        require_room(path, sum(info.file_size for info in archive.infolist()))
+        members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+        arrays = {one.filename[: -len(".npy")]: _member(path, archive.read(one)) for one in members}
+    return {name: array for name, array in arrays.items() if isinstance(array, list) or array.dtype.kind in "uifb"}
+
+
+def _npy(path: Path) -> np.ndarray | list[np.ndarray]:
+    try:
+        return map_npy(path)
+    except DataError:
+        with path.open("rb") as file:
+            if not _needs_pickle(file):
+                raise
+    require_room(path, path.stat().st_size)
+    return _member(path, path.read_bytes())
+
+
+def _needs_pickle(file: Any) -> bool:
+    try:
+        return bool(_header(file)[2].hasobject)
+    except Exception:  # a damaged header raises nearly anything; reading says so
+        return False
+
+
+def _header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(stream)
+
+
+def _member(path: Path, data: bytes) -> np.ndarray | list[np.ndarray]:
+    """Returns an array, or the arrays of an object array, which is a pickle that may hold nothing else."""
+    stream = io.BytesIO(data)
+    if not _needs_pickle(stream):
+        return read_member(path, data)
+    try:
+        objects = load_arrays(stream)
+    except pickle.UnpicklingError as error:
+        raise DataError(f"{path}: a pickle that is not of plain arrays: {error}; it was not loaded") from None
+    except Exception as error:  # a damaged pickle stream raises nearly anything
+        raise DataError(f"{path}: cannot be read ({type(error).__name__}: {error}); copy it again") from None
+    objects = objects.item() if isinstance(objects, np.ndarray) and objects.shape == () else objects
+    if isinstance(objects, np.ndarray) and objects.ndim > 1:
+        try:  # equal frames in one object array lose their type, not their numbers
+            return objects.astype(np.float64)
+        except (TypeError, ValueError):
+            pass
+    parts = list(objects) if isinstance(objects, (np.ndarray, list, tuple)) else [objects]
+    if not all(isinstance(one, np.ndarray) and one.dtype.kind in "uif" for one in parts):
+        raise DataError(f"{path}: a pickle of other things than arrays of numbers; save the clouds as arrays")
+    return [np.array(one, one.dtype) for one in parts]  # plain arrays, whatever the pickle's

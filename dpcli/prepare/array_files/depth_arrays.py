@@ -1,0 +1,110 @@
+"""Frames of depth in arrays: which array of a file holds them, and which of its axes counts frames."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.path_names import first_names
+from dpcli.prepare.array_files.containers import open_arrays
+
+# names that say depth, and not a picture of it or what lies beside it
+DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
+_SIZES = (  # (height, width) of depth cameras
+    *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
+    *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
+)
+_MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
+_SMALL = 4096  # numbers of an array that may tell of the camera
+_LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
+_WHOLE = 50  # numbers above are no meters
+
+
+def says_depth(name: str) -> bool:
+    """Returns whether a name without suffix says that its pictures are depth, and no picture of depth.
+
+    >>> says_depth("lowres_depth"), says_depth("depth_vis"), says_depth("anna_1")
+    (True, False, False)
+    """
+    return re.search(DEPTH_NAME, name, re.IGNORECASE) is not None
+
+
+def depth_frames(path: Path, array: np.ndarray, stride: int = 1) -> np.ndarray:
+    """Returns every ``stride``-th frame of an array of depth as (T,H,W). Raises DataError of what is none, such as the poses of a
+    camera.
+    """
+    if array.ndim == 2 or array.ndim == 3 and array.shape[2] == 1:  # no picture is one pixel wide
+        array = array.reshape(1, *array.shape[:2])
+    if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
+        array = array[..., 0] if array.shape[3] == 1 else array[:, 0]
+    if array.ndim != 3 or array.dtype.kind not in "uif":
+        raise DataError(
+            f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
+        )
+    _require_frames_first(path, array.shape)
+    if array.shape[1:] in _MATRICES and _are_matrices(array):
+        raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
+    return np.ascontiguousarray(array[::stride])
+
+
+def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
+    """Raises DataError of a shape whose last axis seems to count frames: its first two are a camera's, or the last is tiny."""
+    *first, last = shape
+    usual = tuple(first) in _SIZES and (first[1], last) not in _SIZES and (last, first[1]) not in _SIZES
+    if usual or (min(first) >= _LEAST and min(first) >= _TALL * last):
+        raise DataError(
+            f"{path}: array of shape {shape}; expected (frames, height, width): if its last axis counts the frames, save"
+            " numpy.moveaxis(array, -1, 0)"
+        )
+
+
+def archived_depth(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Returns the array of a file that is called depth, or the only one of two or three dimensions, and the small others."""
+    with open_arrays(path) as opened:
+        arrays = {name: one for name, one in opened.items() if not isinstance(one, list)}
+        shaped = [k for k, v in arrays.items() if v.ndim in (2, 3) and 1 not in v.shape[:2] and v.dtype.kind in "uif"]
+        called = [k for k, v in arrays.items() if says_depth(k) and v.ndim > 1 and v.shape not in _MATRICES]
+        plainly = [k for k in called if k in shaped and "depth" in k.lower()]  # d_depth beside d_color and d_time
+        chosen = next((choice[0] for choice in (called, plainly, shaped) if len(choice) == 1), None)
+        if chosen is None:
+            raise DataError(f"{path}: arrays {first_names(list(arrays), 8) or 'none'}; expected one called depth")
+        others = {name: one for name, one in arrays.items() if name != chosen}
+        depth = np.asarray(arrays[chosen][()])
+        depth = _of_matlab(path, depth) if path.suffix.lower() == ".mat" else depth
+        return depth, {name: np.asarray(one[()]) for name, one in others.items() if np.prod(one.shape) <= _SMALL}
+
+
+def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:
+    """Returns depth (H,W,T), as MATLAB has it, as (T,H,W); also one that a program of another order wrote, where the sizes tell.
+
+    Whole numbers among MATLAB's doubles are counted as such, in millimeters. Raises DataError where nothing tells the order.
+    """
+    if array.ndim not in (2, 3) or min(array.shape[:2]) < _LEAST and min(array.shape[1:]) < _LEAST:
+        raise DataError(f"{path}: array of shape {array.shape}; expected depth (height, width, frames)")
+    if array.dtype.kind == "f" and array.max(initial=0) > _WHOLE and (array == np.floor(array)).all():
+        array = array.astype(np.uint16 if 0 <= array.min() and array.max() < 1 << 16 else np.int32)
+    if array.ndim == 2:
+        return array
+    behind, before = array.shape[:2] in _SIZES, array.shape[1:] in _SIZES
+    if behind == before:
+        behind, before = (
+            _TALL * n <= min(sides)
+            for n, sides in ((array.shape[2], array.shape[:2]), (array.shape[0], array.shape[1:]))
+        )
+    if behind == before:
+        raise DataError(
+            f"{path}: array of shape {array.shape}: whether its first or its last axis counts the frames can't be told; save it as"
+            " .npy (frames, height, width)"
+        )
+    return np.ascontiguousarray(array.transpose(2, 0, 1)) if behind else array
+
+
+def _are_matrices(array: np.ndarray) -> bool:
+    """Returns whether each of some 3x3, 3x4 or 4x4 numbers turns, or projects as a pinhole camera does."""
+    first = array[:, :3, :3].astype(np.float64)
+    turns = np.allclose(first @ first.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+    projects = (first[:, 2] == (0, 0, 1)).all() and not first[:, (0, 1), (1, 0)].any()
+    return bool(turns or projects)

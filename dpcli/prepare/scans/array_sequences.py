@@ -1,0 +1,404 @@
+"""Arrays of many clouds: one file, or each of a folder, holds one sequence or many, as (T,N,3), (N,T,3) or (B,T,N,3)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.path_names import as_utf8, first_names
+from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
+from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.decode.folder_listing import files_below, walk_folders
+from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
+from dpcli.prepare.reader import Item, Sample, natural_key
+from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.times_of_tables import seconds_of
+from dpcli.prepare.series import TEXTS, is_beside, is_hidden
+from dpcli.store.schema import kept_name
+
+UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
+_MOST_CLASSES = 10_000
+_LOOKED_AT = 20  # files of a folder, of which the first good one tells
+
+
+def holds_sequences(raw: Path, others: tuple[str, ...]) -> bool:
+    """Returns whether a path is a file of arrays, or a folder whose first one holds a sequence or more and that has no clouds
+    in other formats, whose suffixes are ``others``.
+    """
+    if raw.is_file():
+        return raw.suffix.lower() in SUFFIXES
+    if not raw.is_dir():
+        return False
+    apart = tuple(suffix for suffix in others if suffix not in (*SUFFIXES, *TEXTS))
+    arrays = []
+    for folder, _, names in walk_folders(raw):  # frames are many: no path is made of each
+        shown = [name for name in names if not is_hidden(name)]
+        if any(name.lower().endswith(apart) for name in shown):
+            return False
+        arrays += [os.path.join(folder, name) for name in shown if _is_array(name)]
+    for path in map(Path, sorted(arrays)[:_LOOKED_AT]):
+        try:
+            if not made_by_dpc(path):
+                with open_arrays(path) as opened:
+                    return bool(find_sources(opened))
+        except (DataError, OSError):
+            continue  # a bad sample: the next one tells
+    return False
+
+
+def _is_array(name: str) -> bool:
+    return name.lower().endswith(SUFFIXES) and not is_beside(name)
+
+
+@dataclass(frozen=True)
+class ArraySequences:
+    """Reads arrays of many clouds. axes: their letters, as `axes.check_axes` has them, "" where shapes and values tell; the
+    rest as `CloudFolders` has it.
+    """
+
+    raw: Path
+    axes: str = ""
+    scale: float | None = None
+    unit: str = "m"
+    fps: float | None = None
+    stride: int = 1
+    label_from_folder: bool = False
+    labels: Path | None = None
+    keep: tuple[str, ...] = ()
+    pattern: str = ""
+
+    def __post_init__(self) -> None:
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+        object.__setattr__(self, "axes", check_axes(self.axes))
+        Lengths(self.scale, self.unit)
+
+    @property
+    def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
+        return self._table.class_names if self._table else []
+
+    @property
+    def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
+        return self.unit
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Returns the optional fields that every sample has."""
+        time, color = self._first
+        return (("time",) if time else ()) + (("color",) if color else ()) + tuple(map(kept_name, self.keep))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+
+    @cached_property
+    def _paths(self) -> dict[str, Path]:
+        """Returns the files by the names of their sequences."""
+        if self.raw.is_file():
+            return {as_utf8(self.raw.stem): self.raw}
+        if not self.raw.is_dir():
+            raise DataError(
+                f"{self.raw}: does not exist; expected a file of arrays ({', '.join(SUFFIXES)}), or a folder of them"
+            )
+        files = [path for path in files_below(self.raw) if _is_array(path.name) and self._is_wanted(path.name)]
+        kept = sorted(
+            (path for path in files if not made_by_dpc(path)),
+            key=lambda path: natural_key(path.relative_to(self.raw).as_posix()),
+        )
+        named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in kept}
+        if not named:
+            asked = f" whose names fit --pattern '{self.pattern}'" if self.pattern else ""
+            raise DataError(f"{self.raw}: no files of arrays ({', '.join(SUFFIXES)}){asked}")
+        if len(named) < len(kept):
+            twin = next(path for path in kept if path not in named.values())
+            raise DataError(f"{twin}: there is a file of the same name in another format; keep one of them")
+        return named
+
+    def _is_wanted(self, name: str) -> bool:
+        return not self.pattern or fnmatchcase(name, self.pattern)
+
+    @cached_property
+    def _items(self) -> list[Item]:
+        items: list[Item] = []
+        for name, path in self._paths.items():
+            try:
+                with open_arrays(path) as arrays:
+                    sources = find_sources(arrays, self.axes) or _refuse(path, arrays, self.axes)
+            except DataError as error:
+                items.append(Item(name, path, problem=str(error)))
+                continue
+            items += [
+                Item(f"{name}/{as_utf8(own.name)}" if own.name else name, path, extra={"source": own})
+                for own in sources
+            ]
+        return items
+
+    @cached_property
+    def _first(self) -> tuple[bool, bool]:
+        """Returns whether the first good sequence has times, and whether it has colors."""
+        for item in self._items:
+            if not item.problem:
+                try:
+                    return self._told(item)
+                except DataError:
+                    continue  # a bad sample: the next one tells
+        return self.fps is not None, False
+
+    def _told(self, item: Item) -> tuple[bool, bool]:
+        source: Source = item.extra["source"]
+        with open_arrays(item.path) as arrays:
+            beside, axes = self._beside(item.path, arrays, source)
+            timed = self.fps is not None or (beside.times and _times(arrays, beside, axes, source) is not None)
+            return bool(timed), bool(beside.colors)
+
+    def _beside(self, path: Path, arrays: Mapping[str, Any], source: Source) -> tuple[Beside, str]:
+        """Returns what lies beside the array of one sequence, and the letters of its axes, "" of lists and single frames."""
+        array = arrays[source.keys[0]]
+        if isinstance(array, list) or len(source.keys) > 1 or array.ndim == 2:
+            return Beside(), ""
+        facts = path.stat()
+        axes = self.axes or _axes(path, source.keys[0], facts.st_size, facts.st_mtime_ns)
+        if not axes:
+            raise DataError(_which(path, array.shape))
+        beside = find_beside(arrays, source.keys[0], axes)
+        if beside.labels and "B" not in axes and not self.axes:
+            raise DataError(
+                f"{path}: has a number in {beside.labels!r} for each of the {array.shape[axes.index('T')]} clouds of shape"
+                f" {tuple(array.shape)}; if each is a sample of one frame, give --axes {axes.replace('T', 'B')}, if all are"
+                f" frames of one sequence --axes {axes}"
+            )
+        return beside, axes
+
+    @cached_property
+    def _table(self) -> LabelTable | None:
+        if self.labels:
+            return read_labels(self.labels)
+        if self.label_from_folder:
+            return labels_of_folders(self.raw, [item.name for item in self._items], "CLASS/FILE")
+        return self._labels_inside()
+
+    def _labels_inside(self) -> LabelTable | None:
+        """Returns the labels that files with many sequences each hold beside them, whole numbers from 0; None without them."""
+        rows: dict[str, Row] = {}
+        for path in self._paths.values():
+            own = [item for item in self._items if item.path == path and not item.problem]
+            if not own or own[0].extra["source"].place is None:
+                return None
+            with open_arrays(path) as arrays:
+                try:
+                    beside, _ = self._beside(path, arrays, own[0].extra["source"])
+                except DataError:
+                    return None
+                values = np.asarray(arrays[beside.labels][()]).reshape(-1) if beside.labels else np.zeros(0)
+            if (
+                len(values) != len(own)
+                or (values != np.floor(values)).any()
+                or values.min() < 0
+                or values.max() > _MOST_CLASSES
+            ):
+                return None
+            rows |= {item.name: Row(int(label), -1, "") for item, label in zip(own, values)}
+        return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
+
+    def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
+        time, color = self._first
+        items = [
+            Item(one.name, one.path, extra={**one.extra, "time": time, "color": color}, problem=one.problem)
+            for one in self._items
+        ]
+        return self._table.apply(items) if self._table else items
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
+        source: Source = item.extra["source"]
+        with open_arrays(item.path) as arrays:
+            beside, axes = self._beside(item.path, arrays, source)
+            frames = _frames(item.path, arrays, source, axes)
+            colors = _cut(arrays[beside.colors], axes, source.place) if item.extra["color"] and beside.colors else None
+            kept = {name: self._column(item.path, arrays, name, source, axes) for name in self.keep}
+            time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
+            real = _real_points(arrays, beside, axes, source, frames)
+        if item.extra["time"] and time is None:
+            if not self.fps:
+                raise DataError(
+                    f"{item.path}: no array beside its clouds tells times that rise, though the first file has one"
+                )
+            time = np.arange(len(frames)) / self.fps
+        if item.extra["color"] and colors is None:
+            raise DataError(f"{item.path}: no colors beside its clouds, though the first file has them")
+        clouds = [
+            Cloud(
+                frame,
+                None if colors is None else colors[t],
+                extra={name: values[t].astype(np.float32) for name, values in kept.items()},
+            )
+            for t, frame in enumerate(frames)
+        ]
+        dropped = sum(int(np.count_nonzero(~own)) for own in real)
+        for cloud, own in zip(clouds, real):
+            cloud.keep(own)
+        clouds = clouds[:: self.stride]
+        sample = assemble(
+            item,
+            clouds,
+            Lengths(self.scale, self.unit),
+            color=item.extra["color"],
+            time=None if time is None else time[:: self.stride],
+        )
+        sample.notes |= {UNCOUNTED: dropped} if dropped else {}
+        return sample
+
+    def _column(self, path: Path, arrays: Mapping[str, Any], name: str, source: Source, axes: str) -> np.ndarray:
+        flat = tuple(length for letter, length in zip(axes, arrays[source.keys[0]].shape) if letter != "C")
+        if not axes or name not in arrays or tuple(arrays[name].shape) != flat:
+            raise DataError(
+                f"{path}: --keep-fields {name}: no array of one number for each point, {flat or 'as frames have'}"
+            )
+        return _cut(arrays[name], axes.replace("C", ""), source.place)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
+        files = len(self._paths)
+        lines = [
+            f"{len(items)} sequence{'s' if len(items) != 1 else ''} in {files} file{'s' if files != 1 else ''} of arrays"
+        ]
+        good = next((item for item in items if not item.problem), None)
+        if good:
+            lines[0] += self._how(good)
+        return lines + (self._table.unnamed(items) if self._table else [])
+
+    def _how(self, item: Item) -> str:
+        """Returns how the axes of the first array are taken, and which arrays beside it are not read."""
+        source: Source = item.extra["source"]
+        try:
+            with open_arrays(item.path) as arrays:
+                beside, axes = self._beside(item.path, arrays, source)
+                used = {
+                    *source.keys,
+                    *beside.named(),
+                    *self.keep,
+                    *(one.extra["source"].keys[0] for one in self._items if one.path == item.path and not one.problem),
+                }
+                unread = [name for name in arrays if name not in used]
+                shape = tuple(arrays[source.keys[0]].shape) if axes else ()
+        except DataError:
+            return ""
+        said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
+        extra = shape[axes.index("C")] - 3 if axes else 0
+        said += f"; of each point the first 3 of {extra + 3} numbers are read" if extra else ""
+        return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
+
+
+@lru_cache(maxsize=64)  # an array holds many sequences; each process looks at it once
+def _axes(path: Path, key: str, _size: int, _changed: int) -> str:
+    with open_arrays(path) as arrays:
+        return axes_of(arrays[key])
+
+
+def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
+    shapes = [
+        f"{name or 'an array'} {'list' if isinstance(one, list) else tuple(one.shape)}" for name, one in arrays.items()
+    ]
+    flat = [one for one in arrays.values() if not isinstance(one, list) and one.ndim == 2]
+    if flat and not axes:
+        raise DataError(
+            f"{path}: one cloud, or none, in {first_names(shapes, 5)}; expected (frames, points, 3), or a folder whose files are the"
+            " frames"
+        )
+    wanted = (
+        f"{len(axes)} axes (--axes {axes})" if axes else "shape (frames, points, 3) or (sequences, frames, points, 3)"
+    )
+    raise DataError(f"{path}: holds {first_names(shapes, 5) or 'no arrays of numbers'}; expected an array of {wanted}")
+
+
+def _which(path: Path, shape: tuple[int, ...]) -> str:
+    first, *others = choices(tuple(shape))
+    return (
+        f"{path}: an array of shape {tuple(shape)}, whose order can't be told from its numbers; say it: --axes {first} or"
+        f" {', '.join(others)} (T frames, N points, C x y z, B sequences)"
+    )
+
+
+def _cut(array: Any, axes: str, place: int | None) -> np.ndarray:
+    """Returns the part of one sequence with frames first, (T,N) or (T,N,C): rows and columns of points one after the other."""
+    values = np.asarray(array[tuple(place if letter == "B" else slice(None) for letter in axes)])
+    left = axes.replace("B", "")
+    rank = {"T": 0, "N": 1, "C": 2}
+    values = values.transpose(sorted(range(len(left)), key=lambda axis: (rank[left[axis]], axis)))
+    frames = values.shape[0] if "T" in left else 1
+    return values.reshape(frames, -1, *([values.shape[-1]] if "C" in left else []))
+
+
+def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) -> list[np.ndarray]:
+    """Returns the points of each frame, (N,3) of the file's precision."""
+    if axes:
+        return list(_as_points(_cut(arrays[source.keys[0]], axes, source.place)))
+    if len(source.keys) > 1:
+        return [_as_points(np.asarray(arrays[key][()])) for key in source.keys]
+    parts = arrays[source.keys[0]]
+    if source.place is not None:
+        own = axes_of(parts[source.place])
+        if not own:
+            raise DataError(_which(path, parts[source.place].shape))
+        return list(_as_points(_cut(parts[source.place], own, None)))
+    turned = sum(one.shape[0] == 3 and one.shape[1] != 3 for one in parts if one.size)
+    by_columns = turned and all(one.shape[0] == 3 for one in parts if one.size)
+    if turned and not by_columns:
+        raise DataError(
+            f"{path}: some of its {len(parts)} clouds are (3, points) and some (points, 3 or more); save them alike"
+        )
+    return [_as_points(one.T if by_columns else one) if one.size else np.zeros((0, 3), np.float32) for one in parts]
+
+
+def _as_points(array: np.ndarray) -> np.ndarray:
+    kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
+    return array[..., :3].astype(kind)
+
+
+def _of_frames(array: Any, axes: str, shape: tuple[int, ...], place: int | None) -> np.ndarray:
+    """Returns the numbers (T) of one sequence's frames, of an array that has one for each frame of all, or of one sequence."""
+    sides = {letter: length for letter, length in zip(axes, shape) if letter in "BT"}
+    values = np.asarray(array[()]).reshape(-1)
+    return (
+        _cut(values.reshape(tuple(sides.values())), "".join(sides), place).reshape(-1)
+        if len(values) == np.prod([*sides.values()], dtype=int)
+        else values
+    )
+
+
+def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
+    """Returns seconds since the first frame, f64 (T), that an array tells; None where it tells none that rise."""
+    if not beside.times:
+        return None
+    array = arrays[beside.times]
+    values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place).astype(np.float64)
+    since = (values - values[0]) * seconds_of(beside.times.rpartition("/")[2], values)
+    return since if len(since) < 2 or (np.diff(since) > 0).all() else None
+
+
+def _real_points(
+    arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source, frames: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Returns which points of each frame are no padding, by the counts or the mask beside them: bool (N) each."""
+    if beside.mask:
+        return list(_cut(arrays[beside.mask], axes.replace("C", ""), source.place) != 0)
+    if beside.counts:
+        counts = _of_frames(arrays[beside.counts], axes, arrays[source.keys[0]].shape, source.place)
+        return [np.arange(len(frame)) < count for frame, count in zip(frames, counts)]
+    return [np.ones(len(frame), bool) for frame in frames]
