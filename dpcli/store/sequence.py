@@ -86,10 +86,6 @@ class CloudSequence:
         """Returns the points of frame t, f32 (N_t,3), a view."""
         return self.points[self.frame_offsets[t] : self.frame_offsets[t + 1]]
 
-    def original_frame(self, t: int) -> np.ndarray:
-        """Returns the points of frame t where the raw data have them, f64 (N_t,3): with the shift added."""
-        return self.frame(t).astype(np.float64) + (0.0 if self.shift is None else self.shift)
-
     def value(self, name: str) -> Any:
         """Returns a field by its name in the file, kept columns among them; None when the sample lacks it."""
         return self.extra.get(name) if name.startswith(KEPT) else getattr(self, name)

@@ -27,7 +27,7 @@ from dpcli.store import CloudSequence
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 MARGIN = 0.01  # meters by which a box is larger than its label says
-SCANS, LISTED = 7481, {"train": 3712, "val": 3769}
+SCANS = 7481
 _SPLITS = {"train": "train", "val": "validation"}
 
 
