@@ -36,30 +36,23 @@ def recalls(scores: np.ndarray, labels: np.ndarray, classes: int) -> np.ndarray:
         return 100 * right / count
 
 
-def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str], list[str]]:
-    """Returns the recall of each class of the test videos, class names, the videos' names."""
+def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str]]:
+    """Returns the recall of each class of the test videos, and the class names."""
     reader = ScoresReader(path)
     if stream is not None and stream not in reader.streams:
         raise DataError(f"{path}: no stream {stream!r}; the file has {', '.join(reader.streams) or 'none'}")
     scores = reader.scores if stream is None else reader.streams[stream]
     test = np.array([split in ("test", "") for split in reader.splits]) & (reader.labels >= 0)
-    names = [name for name, own in zip(reader.names, test) if own]
-    return recalls(scores[test], reader.labels[test], len(reader.class_names)), reader.class_names, sorted(names)
+    return recalls(scores[test], reader.labels[test], len(reader.class_names)), reader.class_names
 
 
-def gains(files: Sequence[Path], static: Sequence[Path] | None = None) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns class names, static recall and gain of the final score over it, percentage points f64 (C), means over files.
-
-    static: where the static stream's scores are, `files` themselves by default, in the same order.
-    """
+def gains(files: Sequence[Path]) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Returns class names, static recall and gain of the final score over it, percentage points f64 (C), means over files."""
     before, after = [], []
-    for path, base in zip(files, static or files, strict=True):
-        own, names, videos = _of(base, "static")
-        new, others, same = _of(path)
-        if names != others or videos != same:
-            raise DataError(f"{path}: other classes or videos than {base}; predict both on the same file of clouds")
+    for path in files:
+        own, names = _of(path, "static")
         before.append(own)
-        after.append(new)
+        after.append(_of(path)[0])
     return names, np.mean(before, 0), np.mean(after, 0) - np.mean(before, 0)
 
 

@@ -73,7 +73,6 @@ def parts_picture(
     sequences: Sequence[CloudSequence],
     *,
     truth: Sequence[CloudSequence | None] | None = None,
-    titles: Sequence[str] | None = None,
     frames: int = 4,
     look: Look | None = None,
 ) -> None:
@@ -90,11 +89,10 @@ def parts_picture(
     for index, sequence in enumerate(sequences):
         real = truth[index] if truth is not None else None
         found = _parts_of(sequence)
-        title = titles[index] if titles is not None else sequence.name
         if real is not None:
             found = matched_ids(found, _true_parts(sequence, real))
         shown = spread_evenly(sequence.num_frames, frames)
-        rows.append((title, found, _draw_row(sequence, found, shown, look)))
+        rows.append((sequence.name, found, _draw_row(sequence, found, shown, look)))
         if real is not None:
             rows.append(("truth", real.part, _draw_row(sequence, real.part, shown, look)))
     save_picture(_assemble(rows, look), path)
