@@ -64,7 +64,7 @@ def stored_confidence(notes: dict[str, Any]) -> Confidence | None:
         sound = False
     if not sound:
         raise DataError(
-            f"the weights' notes hold no temperature and threshold but {str(notes[NOTE])[:80]!r}; train again"
+            f"the weights' notes should hold a temperature and a threshold, but hold {str(notes[NOTE])[:80]!r}; train again"
         )
     return found
 

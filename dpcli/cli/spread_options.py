@@ -40,7 +40,7 @@ class SpreadOptions:
             min=1,
             max=1024,
             rich_help_panel=RUNNING,
-            help="Processes. Default: as many CPUs as make it faster; one on a GPU.",
+            help="Processes. Default: as many as make it faster; one on a GPU.",
         ),
     ] = None
     shard: Shard = ""

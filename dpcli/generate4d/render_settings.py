@@ -39,7 +39,7 @@ class RenderSettings:
     fps: float | None = setting(
         None, "Pictures per second; none: the clip's own rate, or a multiple of it.", least=1, most=120
     )
-    time: float | None = setting(None, "Second at which the clip stands still; none: it plays, looped.")
+    time: float | None = setting(None, "Second at which the clip is frozen; none: it plays in a loop.")
     color: Color = setting(
         "appearance", "What the colors show: the object's own, its parts, the rigid weight, or depth."
     )

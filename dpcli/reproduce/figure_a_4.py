@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import save_figure
 from dpcli.errors import DataError
 from dpcli.evaluate.classification.metrics import predicted_labels
 from dpcli.reproduce.runs import DASH, markdown, some, write_json, write_text
@@ -94,8 +95,7 @@ def picture(names: Sequence[str], found: Mapping[str, np.ndarray], path: Path) -
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set_xticks(range(len(known)), [names[k] for k in known], rotation=60, ha="right", fontsize=8)
         axes.set(title=TITLES[key], ylabel="gain, percentage points")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120, format="png")
+    save_figure(figure, path, 120)
 
 
 def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict[str, np.ndarray]:

@@ -58,7 +58,7 @@ def from_environment() -> Processes:
             )
         )
     except ValueError:
-        raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is no number; start with torchrun, or unset them") from None
+        raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is not a number; start with torchrun, or unset them") from None
 
 
 @contextmanager

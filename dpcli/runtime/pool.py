@@ -89,7 +89,7 @@ def _new_pool(jobs: int) -> ProcessPoolExecutor:
     except (OSError, ImportError) as error:
         said = error.strerror if isinstance(error, OSError) else error
         raise DpcError(
-            f"this machine lets processes share no locks, which lie in /dev/shm ({said}); --jobs 1 needs none"
+            f"processes can't share locks on this machine, which needs /dev/shm for them ({said}); --jobs 1 needs none"
         ) from None
 
 

@@ -223,11 +223,11 @@ class _IrregularFrames:
             return
         if len(points) == 0:
             if not self.empty:
-                log.warn(f"frame {number} has no points: they are taken to be at the origin; told once")
+                log.warn(f"frame {number} has no points: they are taken to be at the origin; reported once")
             self.empty += 1
         elif len(points) < _SPARSE:
             if not self.sparse:
-                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; told once")
+                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; reported once")
             self.sparse += 1
 
     def sum_up(self) -> None:

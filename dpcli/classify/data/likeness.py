@@ -90,7 +90,7 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
     if size and far is not None and in_units and not size / _OTHER_UNIT < far < size * _OTHER_UNIT:
         log.warn(
             f"{what}: half of the points lie within {far:.3g} of the middle, within {size:.3g} in what {model} learned from:"
-            " another unit of length? The scores mean nothing then; `dpc prepare clouds --scale` brings both to the same"
+            " is the unit of length another one? The scores would be meaningless; `dpc prepare clouds --scale` converts one to the other"
         )
     if far is None:
         return

@@ -31,7 +31,9 @@ class PacSettings:
     def __post_init__(self) -> None:
         check(self)
         if self.target is not None and self.rule == "activation":
-            raise UsageError("class: the rule activation (thesis A.1.4) knows no class; add --set rule=gradient")
+            raise UsageError(
+                "class: the rule activation (thesis A.1.4) doesn't depend on a class; add --set rule=gradient"
+            )
 
 
 PAC = Catalog(pac=PacSettings)

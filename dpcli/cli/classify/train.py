@@ -41,7 +41,7 @@ def train(
     typer.echo(result.weights)
     if not result.accuracy:
         typer.echo(
-            "no video was held out to judge it: `dpc classify predict` and `dpc evaluate classification` on others do"
+            "no video was held out to judge it: use `dpc classify predict` and `dpc evaluate classification` on other videos"
         )
     else:
         scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in result.accuracy.items())

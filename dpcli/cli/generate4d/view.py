@@ -14,7 +14,8 @@ def view(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page (.html).")],
     clip: Annotated[
-        Path | None, typer.Option("--input", help="The clip that was fitted (.h5): its pictures are shown beside.")
+        Path | None,
+        typer.Option("--input", help="The clip that was fitted (.h5), whose pictures are shown beside the scene."),
     ] = None,
     title: Annotated[str | None, typer.Option("--title", help="Heading. Default: what was fitted.")] = None,
     min_opacity: Annotated[

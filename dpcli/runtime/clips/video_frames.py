@@ -241,7 +241,7 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
     if left := empty_frames(path, stream.index):
         log.warn(f"{path}: {left} frames have no bytes: the program that recorded it left them out, as they are here")
     if cut:
-        log.warn(f"{path}: the file ends before its container does; frames behind the {held} that it holds may be lost")
+        log.warn(f"{path}: the file ends before its container does; frames after the {held} that it holds may be lost")
 
 
 def _declared_and_held(

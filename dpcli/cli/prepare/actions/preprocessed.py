@@ -19,8 +19,7 @@ def preprocessed(
     form: Annotated[
         Literal["auto", "msraction3d", "ntu60", "pts_label"],
         typer.Option(
-            "--form",
-            help="msraction3d, ntu60: one .npz per video. pts_label: gestures. auto: told by the first file found.",
+            "--form", help="msraction3d, ntu60: one .npz per video. pts_label: gestures. auto: by the first file found."
         ),
     ] = "auto",
     labels: Annotated[
