@@ -217,7 +217,7 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     else:
         log.warn(
             f"{root}: the classes are {first_names(sorted(below))}; the folders below are the same in each ({listed}): if those"
-            " are the classes, say so in a table (--labels)"
+            " are the classes, give them in a table (--labels)"
         )
 
 

@@ -216,7 +216,7 @@ class _IrregularFrames:
             if not self.gaps:
                 log.warn(
                     f"nothing came for {silent:.1f} s before frame {number}: the frames before and after it count as"
-                    " neighbors; told once"
+                    " neighbors; reported once"
                 )
             self.gaps += 1
         if self._few:

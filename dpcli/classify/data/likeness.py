@@ -61,7 +61,7 @@ def tell_rounded(what: str, found: dict[str, float]) -> None:
     if found.get("step", 0) > _ROUNDED * found.get("extent", np.inf):
         log.warn(
             f"{what}: coordinates are so large, as on a map, that float32 rounds them to {found['step']:.2g}, while half of the"
-            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a place nearby before the file is"
+            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a nearby position before the file is"
             " written, as `dpc prepare clouds` does"
         )
 

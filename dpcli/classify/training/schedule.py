@@ -36,8 +36,8 @@ class Schedule:
     )
     fine_tune: Literal["all", "head", "probe", "auto"] = setting(
         "all",
-        "What of a model given by --init goes on learning: all of it, the head of each stream, or its last layer (probe); auto:"
-        " by the number of videos a class. The preset auto takes auto, and the model's own network, with --init.",
+        "Layers of a model given by --init that are trained: all, the head of each stream, or its last layer (probe); auto: by"
+        " the number of videos per class. With --init the preset auto takes auto and the model's own network.",
     )
     clips_per_video: int = setting(1, "Random clips per video and epoch; 0 takes every start.", least=0)
     validate_every: int = setting(1, "Epochs from one validation to the next.", least=1)

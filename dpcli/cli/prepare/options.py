@@ -28,7 +28,7 @@ ItemSeconds = Annotated[
         "--item-seconds",
         min=0,
         rich_help_panel=RUNNING,
-        help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is passed over."
+        help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is skipped."
         " 0: no limit.",
     ),
 ]

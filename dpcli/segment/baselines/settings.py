@@ -40,7 +40,7 @@ class ClassicalSettings:
     )
     motion: Literal["auto", "none", "flow", "residual"] = setting(
         "auto",
-        "What stands beside the coordinates: nothing, the flow, or the residual, which is the flow less the dominant"
+        "What is used besides the coordinates: nothing, the flow, or the residual, which is the flow minus the dominant"
         " rigid motion of the frame; auto: none for dbscan and ward, flow for ssc, residual for trajaffn.",
     )
     max_parts: int = setting(8, "Most parts where a classical --method finds their number.", least=1)
