@@ -1,4 +1,4 @@
-"""Confidence that can be believed, and the threshold below which nothing is said to happen.
+"""Calibrated confidence, and the threshold below which nothing counts as recognized.
 
 Temperature scaling (Guo et al. 2017): probabilities are raised to the power 1 / temperature and normalized again. The
 best class stays the best; what changes is how sure it is.

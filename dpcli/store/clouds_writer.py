@@ -27,7 +27,7 @@ _PER_SAMPLE = {
     if field.shape == ("S",) and not field.optional
 }
 _INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
-_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, whoever names them: equal bytes
+_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, however they are named: equal bytes
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 

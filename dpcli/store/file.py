@@ -110,7 +110,7 @@ def _is_utf8(text: str) -> bool:
 def _refuse_outside(file: h5py.File, path: Path) -> None:
     """Raises DataError for what lies outside the file, or is no number and no text: hostile files could name others, or pickles.
 
-    Also for many objects, and for one under several names: groups that hold each other twice would be looked at for ever.
+    Also for many objects, and for one under several names: groups that hold each other twice would be looked at forever.
     """
     seen = {h5py.h5o.get_info(file.id).addr}
 

@@ -36,7 +36,7 @@ class ViewsHeader:
 
     name: str. intrinsics: f64 (V,3,3) pixels, pixel centers at +0.5. world_to_camera: f64 (V,4,4) rigid, OpenCV axes.
     time: f64 (T) seconds, rising. role: V of reference | train | test, with one reference. reference: its index.
-    size: (width, height) pixels. length_unit: of the world; "" = nobody knows.
+    size: (width, height) pixels. length_unit: of the world; "" = unknown.
     """
 
     name: str

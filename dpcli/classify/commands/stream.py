@@ -171,7 +171,7 @@ def _follow(
             made = predictor.add(points)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
-    except BrokenPipeError:  # nobody reads the lines any more
+    except BrokenPipeError:  # nothing reads the lines any more
         raise
     except (DpcError, OSError, KeyboardInterrupt) as error:
         problem = error

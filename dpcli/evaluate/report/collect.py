@@ -145,7 +145,7 @@ def _strict_json(text: str) -> Any:
 
 
 def _check_result(found: Any, where: str) -> dict[str, Any]:
-    """Returns the object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
+    """Returns the object if it has the structure of a result, of whatever task. Raises DataError if not."""
     if not isinstance(found, dict) or not isinstance(found.get("task"), str):
         shown = (
             f"an object with {', '.join(list(found)[:5]) or 'nothing'}"

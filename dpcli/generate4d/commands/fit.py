@@ -161,7 +161,7 @@ def _preview_writer(folder: RunFolder, targets: Targets) -> Callable[[Model4D], 
     def write(model: Model4D) -> None:
         first = not path.exists()
         write_preview(model, targets, path)
-        if first:  # before the first step: whoever waits can look at the start from all sides
+        if first:  # before the first step, so that the start can be looked at from all sides
             log.info(f"{path}: a preview from all sides, updated as the fit goes on")
 
     return write

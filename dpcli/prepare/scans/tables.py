@@ -179,7 +179,7 @@ class TableSequences:
 
 @dataclass(frozen=True)
 class Loaded:
-    """Holds a table that was read: all its points, its sequences, the frame column, columns that nobody asked for, and the
+    """Holds a table that was read: all its points, its sequences, the frame column, columns that were not asked for, and the
     times that some of these tell.
     """
 

@@ -132,7 +132,7 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
 
 
 def _ends_of_alpha(frame) -> tuple[int, int]:  # av.VideoFrame
-    """Returns the least and the greatest alpha: some writers fill a channel that nobody asked for, with 255 or with 0."""
+    """Returns the least and the greatest alpha: some writers add a needless channel, filled with 255 or 0."""
     alpha = _levels(frame, frame.width, {})[..., 3]
     return int(alpha.min()), int(alpha.max())
 

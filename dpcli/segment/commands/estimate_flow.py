@@ -170,7 +170,7 @@ def estimate_flow_of_file(
 
 
 def _worthwhile_processes(work: FlowOfSequence, frames: int) -> int:
-    """Returns how many processes pay: one for each core where rigid bodies are found, which takes one core, else one."""
+    """Returns how many processes are worthwhile: one for each core for the search of rigid bodies, which uses one core, else one."""
     return cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1
 
 

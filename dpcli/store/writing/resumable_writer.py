@@ -184,7 +184,7 @@ class ResumableWriter(ABC):
         return f"the {self._recorded} samples done are kept" if self._journal and self._recorded else ""
 
     def _needed(self) -> int:
-        """Returns about how many bytes all samples take, journal and all, by what those done take; 0 where nobody knows."""
+        """Returns about how many bytes all samples take, journal and all, estimated from those done; 0 where unknown."""
         files = [self._atomic.part, self._journal.path] if self._journal and self._recorded else []
         return sum(one.stat().st_size for one in files if one.exists()) * self.expected // max(self._recorded, 1)
 
