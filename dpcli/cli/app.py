@@ -32,7 +32,7 @@ ROOMS = {
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "Fit, draw and export a 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.",
+    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; also as a contact sheet or a page.",
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
@@ -236,7 +236,7 @@ def _keeping_inputs(command: Any) -> Any:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run `dpc`; exits with the code that design.md section 2 lists."""
+    """Runs `dpc` and exits with one of the codes in docs/architecture.md."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = _keeping_inputs(_checking_values(typer.main.get_command(application(_words_to_complete() or arguments))))
     code = _run(command, arguments)

@@ -18,7 +18,7 @@ Shard = Annotated[
         "--shard",
         metavar="I/N",
         rich_help_panel=RUNNING,
-        help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them.",
+        help="Only every Nth sample, starting at I (0 to N-1); dpc prepare merge joins the shards.",
     ),
 ]
 Dask = Annotated[

@@ -18,7 +18,7 @@ class RenderSettings:
 
     path: Path = setting(
         "turntable",
-        "Way of the camera: once around, orbit (also up and down), swing, fixed, or reference (the input's own camera).",
+        "Path of the camera: turntable (once around), orbit (also up and down), swing, fixed, or reference (the input's own camera).",
     )
     azimuth: float | None = setting(
         None, "Azimuth of the camera, degrees; 0 is at +z, positive toward +x; none: the reference camera's."

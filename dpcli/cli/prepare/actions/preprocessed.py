@@ -35,7 +35,7 @@ def preprocessed(
     ] = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Read clouds others have made: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
+    """Read clouds made by others' code: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
     from dpcli.prepare.actions.preprocessed import open_preprocessed
 
     run_conversion(
