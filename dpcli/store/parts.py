@@ -1,4 +1,4 @@
-"""Files of kind `parts`: what a segmenter says of the points and frame pairs of each sequence."""
+"""Files of kind `parts`: predictions for the points and frame pairs of each sequence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of kind `scores`: what a classifier says of each sample."""
+"""Files of kind `scores`: a classifier's output for each sample."""
 
 from __future__ import annotations
 

@@ -206,7 +206,7 @@ def test_a_journal_of_other_work_stays_and_force_starts_over(killed, tmp_path):
     left = {".a.h5.part": killed[0], ".a.h5.new": killed[2]}
     for name, content in left.items():
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(UsageError, match="kept for it is of other work .config .*, now 2.*--force"):
+    with pytest.raises(UsageError, match="stopped run with other settings or inputs .config .*, now 2.*--force"):
         CloudsWriter(tmp_path / "a.h5", **{**options(), "provenance": {"config": 2}})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
     with CloudsWriter(tmp_path / "a.h5", **{**options(), "force": True}) as writer:

@@ -123,7 +123,7 @@ class ResumableWriter(ABC):
         some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
         said = "; ".join(some) or "an earlier step of its files differs"
         return UsageError(
-            f"{self.path}: a stopped run with other settings ({said}) left its work here; run that command again to continue it,"
+            f"{self.path}: a stopped run with other settings or inputs ({said}) left its work here; run that command again to continue it,"
             " write to another file, or --force to start over"
         )
 

@@ -115,7 +115,7 @@ def test_a_label_map_joins_unlike_classes(two, tmp_path):
         ('[files."c.h5"]\n"g1" = "push"', "no file 'c.h5' among a.h5, b.h5"),
         ('[files."b.h5"]\n"push" = "g1"', "b.h5 has no class 'push'"),
         ('classes = ["g1"]\n', "class 'hand wave' becomes 'hand wave', which classes"),
-        ("[labels]\npush = 3\n", "something that is no name"),
+        ("[labels]\npush = 3\n", "something that is not a name"),
         ("labels = 3\n", "labels is 3, expected a table"),
         ("[label]\nx = 'y'\n", "holds label; expected classes"),
         ("[labels\n", "not TOML"),
