@@ -158,9 +158,7 @@ class RunFolder:
     def refuse_inside(self, option: str, file: Path) -> None:
         """Raises UsageError when `file`, named by an option to start from, is among those that the run replaces."""
         if self.path.resolve() in (file.parent.resolve(), file.resolve().parent):
-            raise UsageError(
-                f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o"
-            )
+            raise UsageError(f"{option} {file}: is in the folder of -o, whose files this run replaces; use another -o")
 
     def file(self, name: str) -> Path:
         """Returns the path of a file of the run."""

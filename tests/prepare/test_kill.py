@@ -226,7 +226,7 @@ def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path
         patch.setattr(item_pass, "ordered_map", dies_after_three)
         run(["toy", "RAW"])
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(UsageError, match="of other work .config.points 0, now 1; config.sampling"):
+    with pytest.raises(UsageError, match="with other settings or inputs .config.points 0, now 1; config.sampling"):
         run(["toy", "RAW", "--points", "1"], points=1)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
     read = []

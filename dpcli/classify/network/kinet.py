@@ -33,10 +33,10 @@ class Kinet(nn.Module):
         """Returns the static stream's logits (B,C) of clips (B,T,P,3+F)."""
         return self.static(self.group(points))
 
-    def dynamic_logits(self, points: Tensor) -> Tensor:
+    def dynamic_logits(self, points: Tensor, groups: list[Grouping] | None = None) -> Tensor:
         """Returns the dynamic stream's logits (B,C). Gradients reach the dynamic branch only; the static network must be in eval
-        mode."""
-        return self.dynamic(self._stages(points)[0])
+        mode. groups: the neighborhoods, where they are known."""
+        return self.dynamic(self._stages(points, groups)[0])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
@@ -44,8 +44,8 @@ class Kinet(nn.Module):
         return static, self.dynamic(stages)
 
     @torch.no_grad()
-    def _stages(self, points: Tensor) -> tuple[list[Stage], Tensor]:
-        return self.static.taps(self.group(points))
+    def _stages(self, points: Tensor, groups: list[Grouping] | None = None) -> tuple[list[Stage], Tensor]:
+        return self.static.taps(self.group(points) if groups is None else groups)
 
     def freeze_static(self) -> None:
         """Stops the static stream's gradients and keeps its batch norms at their running statistics."""

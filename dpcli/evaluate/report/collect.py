@@ -136,7 +136,7 @@ def _strict_json(text: str) -> Any:
     """Returns what JSON says. Raises ValueError for NaN and Infinity, which no result has."""
 
     def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no number")
+        raise ValueError(f"{name} is not a number")
 
     try:
         return json.loads(text, parse_constant=refuse, object_pairs_hook=distinct_keys)

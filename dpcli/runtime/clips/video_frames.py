@@ -108,7 +108,9 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
             raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
         rate = float((stream.codec_context.framerate if bare else stream.average_rate) or 0)
         if bare and rate == _ASSUMED_RATE:
-            log.info(f"{path}: a stream without a container: {rate:g} frames per second, if it tells no other (--fps)")
+            log.info(
+                f"{path}: a stream without a container: {rate:g} frames per second, unless the stream states another rate (--fps)"
+            )
         if container.format.name == "avi" and stream.frames > len(stamps) + 1:
             rate = 0.0  # frames are repeated: their own time stamps tell when, or nothing does
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
@@ -332,7 +334,7 @@ def _require_one_layer(path: Path, stream) -> None:
         packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
         if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
             raise DataError(
-                f"{path}: its alpha lies in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
+                f"{path}: its alpha is in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
                 "ffmpeg -view_ids -1 -i IN -c:v prores_ks -pix_fmt yuva444p10le OUT.mov"
             )
 

@@ -71,7 +71,7 @@ class SceneSegmenter(Segmenter):
         """Warns of frames whose place is unknown, since they overlap with none before them, and of objects left out."""
         if dropped:
             log.warn(
-                f"{name}: {dropped} moving objects besides the largest {self.settings.most_objects} are taken to stand still;"
+                f"{name}: {dropped} moving objects besides the largest {self.settings.most_objects} are assumed to stand still;"
                 " --set most_objects= keeps more"
             )
         if apart:

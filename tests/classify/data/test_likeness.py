@@ -39,7 +39,7 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     notes = {"notes": {NOTE: like(body(points=5))}, "timing": "slots"}
     assert told(capsys, body(points=9), own, **notes) == ""
     assert "a frame has 300 points in the median, 5 in what" in told(capsys, body(), own, **notes)
-    assert "another unit" in told(capsys, body(1000, points=5), own, **notes)
+    assert "length another one" in told(capsys, body(1000, points=5), own, **notes)
     for odd in ({}, {"extent": "long", "points": None}, [1]):
         assert told(capsys, body(1000, points=5), own, notes={NOTE: odd}, timing="slots") == ""  # nothing is known
 

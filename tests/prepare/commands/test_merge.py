@@ -260,7 +260,7 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
     again = write(tmp_path / "c.h5", ["c0", "c1"], ["hand wave", "push", "bend"])
     stopped_after(2, monkeypatch, [two[0], again], out)
     assert journal.exists()
-    with pytest.raises(UsageError, match='of other work .config.merge ."a.h5", "c.h5"., now'):
+    with pytest.raises(UsageError, match='with other settings or inputs .config.merge ."a.h5", "c.h5"., now'):
         merge([again, two[0]], out)
     assert journal.exists()
     merge([again, two[0]], out, force=True)

@@ -25,7 +25,7 @@ class FilmingOptions:
     output: FileOrPipe = ""
     size: PictureSize = 512
     azimuths: Annotated[
-        str, typer.Option("--azimuths", help="Azimuths of the test views, degrees; the input view stands at 0.")
+        str, typer.Option("--azimuths", help="Azimuths of the test views, degrees; the input view is at 0.")
     ] = "15,-75,105,195"
     train_azimuths: Annotated[
         str, typer.Option("--train-azimuths", help="Azimuths of further views to fit to, degrees, such as 90,180.")
