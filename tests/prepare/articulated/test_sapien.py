@@ -579,7 +579,7 @@ def test_nothing_outside_the_folder_is_opened(name, tmp_path):
     shape = f'<mesh filename="{name.format(outside=outside)}"/>'.replace("\1", "x" * 300)
     write_urdf(raw / "mobility.urdf", link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b"))
     problem = Sapien(tmp_path / "raw").items()[0].problem
-    assert "1/mobility.urdf: its mesh" in problem and ("lies outside" in problem or "cannot be a file's" in problem)
+    assert "1/mobility.urdf: its mesh" in problem and ("is outside" in problem or "cannot be a file's" in problem)
     if "x" * 9 not in shape:
         assert not Sapien(tmp_path / "raw", allow_outside=True).items()[0].problem
 
@@ -594,7 +594,7 @@ def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
     write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
     assert not Sapien(tmp_path).items()[0].problem
     assert not Sapien(tmp_path / "robot").items()[0].problem
-    assert "'../meshes/c.obj' lies outside" in Sapien(tmp_path / "robot" / "urdf").items()[0].problem
+    assert "'../meshes/c.obj' is outside" in Sapien(tmp_path / "robot" / "urdf").items()[0].problem
     (tmp_path / "named.urdf").symlink_to(two(tmp_path))
     assert not Sapien(tmp_path / "named.urdf").items()[0].problem
 
