@@ -14,7 +14,7 @@ def differences(before: object, now: object) -> list[str]:
 
 def _settings(value: object, path: str = "") -> dict[str, str]:
     """Returns a nested record as one level, values as JSON: {"network.num_frames": "16"}. None counts as not there: a run that was
-    begun before a setting existed goes on while nobody sets it."""
+    begun before a setting existed continues as long as the setting isn't used."""
     if value is None:
         return {}
     if not isinstance(value, dict):

@@ -13,7 +13,7 @@ _ADDRESS = re.compile(r"<([\w.]+) object at 0x[0-9a-fA-F]+>")
 class DpcError(Exception):
     """The work failed (exit code 1).
 
-    Places in memory, which libraries put into their messages, are left out: they tell nobody anything, and files that keep
+    Memory addresses, which libraries put into their messages, are left out: they are of no use, and files that keep
     the message would differ from run to run.
     """
 

@@ -39,7 +39,7 @@ def require_distinct(path: object, names: Sequence[str]) -> None:
     if len(set(names)) < len(names):
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise DataError(
-            f"{path}: two members of the archive are named {twice!r}; unpack it, choose one and pack it anew"
+            f"{path}: two members of the archive are named {twice!r}; unpack it, keep one of them and pack it again"
         )
 
 
@@ -90,7 +90,7 @@ def map_npy(path: Path) -> np.ndarray:
     behind = path.stat().st_size - array.offset - array.nbytes
     if behind:
         raise DataError(
-            f"{path}: {behind} bytes behind the array of shape {array.shape} that its header declares: several arrays in one"
+            f"{path}: {behind} bytes follow the array of shape {array.shape} that its header declares: several arrays in one"
             " file, or damaged; save each array as its own file"
         )
     return array

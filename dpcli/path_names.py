@@ -62,7 +62,7 @@ def path_inside(root: Path | None, folder: Path, name: str) -> Path:
         inside = False
     if not inside:
         raise DataError(
-            f"{name[:80]!r} lies outside the folder {as_utf8(str(root))}, or isn't named from within it; only files in it"
+            f"{name[:80]!r} is outside the folder {as_utf8(str(root))}, or isn't named from within it; only files in it"
             " are opened"
         )
     return place

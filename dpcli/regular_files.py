@@ -1,4 +1,4 @@
-"""Only regular files are opened: a FIFO would be waited for, for ever."""
+"""Only regular files are opened: a FIFO would be waited for, forever."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EXPECTED = ", expected a regular file"
 def why_unreadable(path: str | Path) -> str:
     """Returns why a path must not be opened, "" where it may be: it is a file, a folder, or nothing that exists.
 
-    Opening a FIFO waits for ever, and a device has no end; a link to nowhere is told from a name that is missing.
+    Opening a FIFO waits forever, and a device has no end; a dangling link is distinguished from a missing name.
     """
     try:
         mode = os.stat(path).st_mode
@@ -38,7 +38,7 @@ _refusing = False  # whether this process is inside `regular_files_only`
 
 @contextmanager
 def regular_files_only() -> Iterator[None]:
-    """Raises DataError in the block where something opens a FIFO, which would wait for ever, or a link to a device, which has
+    """Raises DataError in the block where something opens a FIFO, which would wait forever, or a link to a device, which has
     no end; pipes of the shell are let be.
 
     So no reader and no library (NumPy, Pillow, zipfile) needs to ask first about the files that lie in a sample's folder.

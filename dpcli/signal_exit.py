@@ -145,7 +145,7 @@ def end_at_once(code: int) -> None:
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except (OSError, ValueError):  # nobody reads it any more
+        except (OSError, ValueError):  # nothing reads it any more
             pass
     acknowledge_signal()
     os._exit(code)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 _UNSEEN = re.compile(
     "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\U000e0000-\U000e007f]"
 )
-_PIPE_WIDTH = 250  # columns when nobody's terminal sets a limit
+_PIPE_WIDTH = 250  # columns where no terminal sets a limit
 
 
 def ready_streams() -> None:
     """Makes what is printed to a closed stream go nowhere, and spells a letter that can't be shown; before anything is opened.
 
-    stdin stays None when it is closed, so that who wants it can tell. The number of a closed stream is taken, else the next
+    A closed stdin stays None, so that its readers can tell. The number of a closed stream is occupied, else the next
     file to be opened would get it, and with it all that is printed.
     """
     for number in (0, 1, 2):
@@ -73,7 +73,7 @@ def loud_libraries() -> Iterator[None]:
 
 
 class PrintableStream:
-    """Wraps a text stream so that nothing that commands a terminal reaches it, whoever writes; else acts as that stream."""
+    """Wraps a text stream so that no control sequence reaches a terminal; otherwise acts as that stream."""
 
     def __init__(self, stream: TextIO) -> None:
         self.unfiltered = stream

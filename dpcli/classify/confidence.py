@@ -1,4 +1,4 @@
-"""Confidence that can be believed, and the threshold below which nothing is said to happen.
+"""Calibrated confidence, and the threshold below which nothing counts as recognized.
 
 Temperature scaling (Guo et al. 2017): probabilities are raised to the power 1 / temperature and normalized again. The
 best class stays the best; what changes is how sure it is.
@@ -64,7 +64,7 @@ def stored_confidence(notes: dict[str, Any]) -> Confidence | None:
         sound = False
     if not sound:
         raise DataError(
-            f"the weights' notes hold no temperature and threshold but {str(notes[NOTE])[:80]!r}; train again"
+            f"the weights' notes should hold a temperature and a threshold, but hold {str(notes[NOTE])[:80]!r}; train again"
         )
     return found
 

@@ -77,7 +77,7 @@ def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
     config, size, total = model.config, model.config.group_size + 1, 0
     shapes = [activation.shape[1:3] for stage in stages for activation in stage.activations]
     for number, (unit, (centroids, neighbors)) in enumerate(zip(model.dynamic.units, shapes), 1):
-        unread = config.weighting == "none" or number == len(shapes)  # nobody's weights come from the last deviations
+        unread = config.weighting == "none" or number == len(shapes)  # no weights come from the last deviations
         per_neighbor = size * (size + 1) // 2 + size + (0 if unread else size)
         total += centroids * unit.groups * (neighbors * per_neighbor + size * size)
         total += centroids * neighbors * unit.reduce.weight.numel()

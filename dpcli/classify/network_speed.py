@@ -119,7 +119,7 @@ def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool 
 
 def _profiled(step: Callable[[], tuple[float, float]]) -> tuple[tuple[float, float], float]:
     """Returns what a step returns, and the seconds that it spends in matrix products."""
-    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # its start and stop are nobody's news
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # hides its messages about start and stop
     from torch.profiler import ProfilerActivity, profile
 
     with profile(activities=[ProfilerActivity.CPU]) as trace:

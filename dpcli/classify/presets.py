@@ -134,7 +134,7 @@ BACKBONE_CHANGES: dict[str, dict[str, dict[str, Any]]] = {
 def backbone_changes(preset: str, backbone: str) -> dict[str, Any]:
     """Returns the fields of a preset's network that change with the backbone, by name.
 
-    A user's own (`module:Class`) shares one set of neighborhoods between both streams, and reads from the rest what it wants.
+    A user's own (`module:Class`) shares one set of neighborhoods between both streams, and reads those of the other fields that it needs.
     """
     if backbone == "pointnet2":
         return {"backbone": backbone}

@@ -49,7 +49,7 @@ class TrainingSettings:
                 "--validation cross: needs a network of several members, as preset sparse has; give another rule"
             )
         if self.schedule.fine_tune != "all" and not self.run.init:
-            raise UsageError(f"--fine-tune {self.schedule.fine_tune}: goes on from a model; name it with --init")
+            raise UsageError(f"--fine-tune {self.schedule.fine_tune}: needs a model to start from; name it with --init")
         slots = self.network.backbone == "slots"
         if slots != (self.run.timing == "slots") or (slots and self.schedule.epochs_dynamic):
             raise UsageError(

@@ -32,7 +32,7 @@ ROOMS = {
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "Fit, draw and export a 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.",
+    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; also as a contact sheet or a page.",
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
@@ -91,7 +91,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
 
 
 def _words_to_complete() -> list[str] | None:
-    """Returns the words after `dpc` that a shell wants completed, or None where this is an ordinary run."""
+    """Returns the words after `dpc` that a shell asks to complete, or None in an ordinary run."""
     if "_DPC_COMPLETE" not in os.environ:
         return None
     words = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")  # bash; zsh and fish
@@ -161,7 +161,7 @@ def _explain(error: BaseException) -> int:
 
 
 def _check_value(value: Any, option: Any) -> None:
-    """Raises UsageError for a number that is none, or too large for float32 or a count, DataError for what nobody may read."""
+    """Raises UsageError for NaN and for numbers too large for float32 or a count, DataError for a path without read permission."""
     if isinstance(value, float) and not abs(value) < _LARGEST and value != option.default:
         below = f" below {_LARGEST:g}" if math.isfinite(value) else ""
         raise UsageError(f"{option.opts[-1]} {value}: expected a finite number{below}")
@@ -173,7 +173,7 @@ def _check_value(value: Any, option: Any) -> None:
 
 
 def _checking_values(command: Any) -> Any:
-    """Makes the command, or all below it, end where an option is nan or too large for float32, or a path is unreadable.
+    """Makes the command, or all below it, refuse options that are NaN or too large for float32, and unreadable paths.
 
     A value that is so by default passes. Where memory ends, options far above their defaults are named.
     """
@@ -200,7 +200,7 @@ def _checking_values(command: Any) -> Any:
 
 
 def _keeping_inputs(command: Any) -> Any:
-    """Makes the command, or all below it, end where it would write what it reads, no regular file, or where nobody may."""
+    """Makes the command, or all below it, refuse to write over its inputs, over what is no regular file, or without permission."""
     for below in getattr(command, "commands", {}).values():
         _keeping_inputs(below)
     run = command.callback
@@ -238,7 +238,7 @@ def _keeping_inputs(command: Any) -> Any:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run `dpc`; exits with the code that design.md section 2 lists."""
+    """Runs `dpc` and exits with one of the codes in docs/architecture.md."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = _keeping_inputs(_checking_values(typer.main.get_command(application(_words_to_complete() or arguments))))
     code = _run(command, arguments)

@@ -47,7 +47,7 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.
+    """Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; also as a contact sheet or a page.
 
     Of a model: its classes, configuration and training.
     """

@@ -74,14 +74,15 @@ def _write_scene(path: Path, page: Path, title: str) -> None:
 
 
 def _clouds(path: Path, facts: PageFacts, *, samples: int, chosen: Sequence[str], view: str | None) -> str:
-    from dpcli.draw.page.points import frame_budget, point_budget, points_page, spread
+    from dpcli.draw.page.points import frame_budget, point_budget, points_page
+    from dpcli.draw.sheet import spread_evenly
     from dpcli.draw.view import default_view, parse_view
     from dpcli.store import CloudsReader
 
     with CloudsReader(path) as reader:
         axes = parse_view(view or default_view(reader.length_unit)) * np.array([[1], [-1], [-1]], np.float32)
         rows = _chosen(reader, chosen, samples)
-        frames = {row: spread(int(reader.frame_counts[row]), frame_budget(len(rows))).tolist() for row in rows}
+        frames = {row: spread_evenly(int(reader.frame_counts[row]), frame_budget(len(rows))) for row in rows}
         most = point_budget(sum(map(len, frames.values())))
         sequences = [_sequence(reader, row, frames[row], most, axes) for row in rows]
         kind = str(reader.attributes["dpc_kind"])
@@ -119,13 +120,14 @@ def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[i
 
 def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes: np.ndarray) -> PageSequence:
     """Reads a sequence one frame at a time and keeps `most` points of each."""
-    from dpcli.draw.page.points import PageSequence, spread
+    from dpcli.draw.page.points import PageSequence
+    from dpcli.draw.sheet import spread_evenly
 
     fields = [name for name in ("part", "color", "time") if name in reader.fields]
     kept: dict[str, list[np.ndarray]] = {name: [] for name in ("points", *fields)}
     for frame in frames:
         own = reader.read(row, [frame], fields)
-        some = spread(len(own.points), most)
+        some = spread_evenly(len(own.points), most)
         kept["points"].append(own.points[some] @ axes.T)
         for name in fields:
             kept[name].append(own.time if name == "time" else getattr(own, name)[some])
@@ -178,17 +180,17 @@ def _left_out(reader: CloudsReader, frames: dict[int, list[int]], most: int, cho
 
 def _views(path: Path, facts: PageFacts) -> str:
     from dpcli.draw.page.film import PageView, film_page
-    from dpcli.draw.page.points import spread
+    from dpcli.draw.sheet import spread_evenly
     from dpcli.draw.views_sheet import view_title
     from dpcli.store.views import ViewsReader
 
     with ViewsReader(path) as reader:
         header = reader.header
-        views = spread(header.num_views, _PICTURES // 8).tolist()
+        views = spread_evenly(header.num_views, _PICTURES // 8)
         if header.reference not in views:
             views = [header.reference, *views[1:]]
         views.sort(key=lambda view: view != header.reference)
-        frames = spread(header.num_frames, max(_PICTURES // len(views), 8)).tolist()
+        frames = spread_evenly(header.num_frames, max(_PICTURES // len(views), 8))
         facts.subtitle = " · ".join(
             [
                 f"views of {printable(header.name)}",

@@ -18,7 +18,7 @@ Shard = Annotated[
         "--shard",
         metavar="I/N",
         rich_help_panel=RUNNING,
-        help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them.",
+        help="Only every Nth sample, starting at I (0 to N-1); dpc prepare merge joins the shards.",
     ),
 ]
 Dask = Annotated[
@@ -40,7 +40,7 @@ class SpreadOptions:
             min=1,
             max=1024,
             rich_help_panel=RUNNING,
-            help="Processes. Default: as many CPUs as make it faster; one on a GPU.",
+            help="Processes. Default: as many as make it faster; one on a GPU.",
         ),
     ] = None
     shard: Shard = ""

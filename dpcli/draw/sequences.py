@@ -1,4 +1,4 @@
-"""Declares what the drawing of point clouds needs of a sequence and of a reader, whoever read them."""
+"""Declares what the drawing of point clouds needs from a sequence and from a reader, whatever their classes."""
 
 from __future__ import annotations
 

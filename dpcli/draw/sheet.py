@@ -68,9 +68,9 @@ def text_font(size: int) -> Any:
     return ImageFont.load_default(size=size)
 
 
-def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB, size: int = 13) -> None:
+def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB) -> None:
     """Writes a text in one line on a PIL drawing, shortened to the width (pixels) there is; names may hold ends of lines."""
-    font, text = text_font(size), printable(text)
+    font, text = text_font(13), printable(text)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"
     draw.text(place, text, fill=ink, font=font)

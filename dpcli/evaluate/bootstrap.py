@@ -89,44 +89,33 @@ def means_of_samples(values: Mapping[str, np.ndarray]) -> WeightedMetric:
 
 
 def drawn_counts(
-    samples: int, resamples: int, rng: np.random.Generator, groups: np.ndarray | None = None
+    samples: int, resamples: int, rng: np.random.Generator
 ) -> Iterator[np.ndarray]:  # f64 (R,samples), blocks of rows
-    """Draws `samples` samples with replacement, `resamples` times, and yields how often each was drawn, block by block.
-
-    groups i (samples), 0..G-1: samples of one group are drawn together, G groups each time.
-    """
-    units = samples if groups is None else int(groups.max()) + 1
+    """Draws `samples` samples with replacement, `resamples` times, and yields how often each was drawn, block by block."""
     rows = max(1, _BLOCK // max(samples, 1))
     for start in range(0, resamples, rows):
         count = min(rows, resamples - start)
-        drawn = rng.integers(0, units, (count, units)) + units * np.arange(count)[:, None]
-        counts = np.bincount(drawn.ravel(), minlength=count * units).reshape(count, units).astype(np.float64)
-        yield counts if groups is None else counts[:, groups]
+        drawn = rng.integers(0, samples, (count, samples)) + samples * np.arange(count)[:, None]
+        yield np.bincount(drawn.ravel(), minlength=count * samples).reshape(count, samples).astype(np.float64)
 
 
-def replicates(
-    metric: WeightedMetric, samples: int, rng: np.random.Generator, resamples: int, groups: np.ndarray | None = None
-) -> dict[str, np.ndarray]:
+def replicates(metric: WeightedMetric, samples: int, rng: np.random.Generator, resamples: int) -> dict[str, np.ndarray]:
     """Returns the value of each metric in each resample, f64 (resamples)."""
-    return _joined(metric(counts) for counts in drawn_counts(samples, resamples, rng, groups))
+    return _joined(metric(counts) for counts in drawn_counts(samples, resamples, rng))
 
 
-def left_out_once(
-    metric: WeightedMetric, samples: int, groups: np.ndarray | None = None
-) -> dict[str, np.ndarray] | None:
-    """Returns the jackknife: the value of each metric without each sample (or group), f64 (samples).
+def left_out_once(metric: WeightedMetric, samples: int) -> dict[str, np.ndarray] | None:
+    """Returns the jackknife: the value of each metric without each sample, f64 (samples).
 
     Returns None for more than 2,000 of them: the acceleration that these values serve falls with the root of their
     number and no longer moves an interval there.
     """
-    groups = np.arange(samples) if groups is None else groups
-    units = int(groups.max()) + 1
-    if units > _MOST_LEFT_OUT:
+    if samples > _MOST_LEFT_OUT:
         return None
     rows = max(1, _BLOCK // samples)
     return _joined(
-        metric((groups != np.arange(start, min(start + rows, units))[:, None]).astype(np.float64))
-        for start in range(0, units, rows)
+        metric((np.arange(samples) != np.arange(start, min(start + rows, samples))[:, None]).astype(np.float64))
+        for start in range(0, samples, rows)
     )
 
 
@@ -143,9 +132,8 @@ def bootstrap(
     resamples: int = 2000,
     confidence: float = 0.95,
     method: str = "bca",
-    groups: np.ndarray | None = None,
 ) -> dict[str, Interval]:
-    """Returns the interval of each metric from resamples of `samples` samples (of whole `groups`, see `drawn_counts`).
+    """Returns the interval of each metric from resamples of `samples` samples.
 
     method: "bca", bias-corrected and accelerated (Efron 1987), or "percentile"; ValueError for another. A resample in
     which a metric is 0/0 doesn't count for it; when most are, or there is one sample only, the interval is undefined.
@@ -158,10 +146,10 @@ def bootstrap(
     if method not in METHODS:
         raise ValueError(f"method {method!r}: expected one of {', '.join(METHODS)}")
     estimate = {key: float(value[0]) for key, value in metric(np.ones((1, samples))).items()}
-    if samples < 2 or (groups is not None and groups.max() == 0):
+    if samples < 2:
         return {key: Interval(np.nan, np.nan) for key in estimate}
-    found = replicates(metric, samples, rng, resamples, groups)
-    jackknife = left_out_once(metric, samples, groups) if method == "bca" else None
+    found = replicates(metric, samples, rng, resamples)
+    jackknife = left_out_once(metric, samples) if method == "bca" else None
     return {
         key: interval(
             estimate[key],

@@ -37,11 +37,13 @@ class FitConfig:
     )
     start_radius: float = setting(0.5, "Radius of the sphere of start = sphere, scene units.", above=0)
     gaussians: int = setting(4096, "Gaussians at the start.", least=16)
-    most_gaussians: int = setting(80_000, "Gaussians at most; fewer than `gaussians` also start with fewer.", least=16)
+    most_gaussians: int = setting(
+        80_000, "Gaussians at most; a number below `gaussians` also lowers those at the start.", least=16
+    )
     parts: int = setting(8, "Rigid parts at most; the fit itself blends the motions of 8 at most.", least=1, most=1000)
     control_points: int = setting(512, "Control points at most.", least=1)
     neighbors: int = setting(8, "Control points that move one Gaussian.", least=1)
-    width: int = setting(256, "Units of a layer of the motion networks.", least=1, most=WIDEST)
+    width: int = setting(256, "Width of the motion networks' layers.", least=1, most=WIDEST)
     depth: int = setting(
         8, "Layers of the deformation network; the other networks have half as many.", least=1, most=100
     )
@@ -52,7 +54,7 @@ class FitConfig:
         True, "Start the parts at places spread over the object, not where an untrained network puts them."
     )
 
-    rigid: bool = setting(True, "Rigid motion of parts; false leaves non-rigid motion alone (row a of Table 5.2).")
+    rigid: bool = setting(True, "Use rigid motion of parts; false leaves only non-rigid motion (row a of Table 5.2).")
     temporal: bool = setting(True, "Find parts by temporal-change preservation, eq. 5.3; false: row b of Table 5.2.")
     spatial: bool = setting(True, "Keep neighboring points in one part by spatial coherence, eq. 5.4.")
     fusion: bool = setting(
@@ -70,7 +72,7 @@ class FitConfig:
     )
     shape_until: float = setting(
         0.8,
-        "Share of the steps until which those pictures count; the last ones follow the given views alone.",
+        "Share of the steps in which those pictures count; the last steps use only the given views.",
         least=0,
         most=1,
     )
@@ -100,7 +102,7 @@ class FitConfig:
     rate_color: float = setting(0.01, "Rate of colors.", least=0)
     rate_radius: float = setting(0.005, "Rate of the control points' radii.", least=0)
     rate_network: tuple[float, float] = setting(
-        (2e-4, 2e-6), "Rate of the networks but the parts' motion, first and last, log-linear.", above=0
+        (2e-4, 2e-6), "Rate of all networks except that of the parts' motion, first and last, log-linear.", above=0
     )
     rate_rigid: float = setting(0.01, "Rate of the network of the parts' motion.", least=0)
     rate_control: float = setting(2e-6, "Rate of the control points' positions.", least=0)
@@ -148,14 +150,16 @@ class Supervision:
     prior: Prior = setting(
         "auto",
         "What is known beside the input view: nothing, the inflated silhouette, a network of shapes, the file's views of "
-        "the role train, or a diffusion model; auto takes the network where it is sure, else the inflated silhouette.",
+        "the role train, or a diffusion model; auto takes the network where it is confident, else the inflated silhouette.",
     )
     prior_model: str | None = setting(
         None,
-        "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded; of network: other weights, a "
-        "file or a folder of train-prior.",
+        "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded; or of --prior network: "
+        "other weights, a file or a folder of train-prior.",
     )
-    regularize: bool = setting(True, "Keep the object from going flat by the loss `thickness` and the limit `aspect`.")
+    regularize: bool = setting(
+        True, "Keep the object from becoming flat by the loss `thickness` and the limit `aspect`."
+    )
 
     def __post_init__(self) -> None:
         check(self)

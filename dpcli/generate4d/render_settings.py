@@ -18,7 +18,7 @@ class RenderSettings:
 
     path: Path = setting(
         "turntable",
-        "Way of the camera: once around, orbit (also up and down), swing, fixed, or reference (the input's own camera).",
+        "Path of the camera: turntable (once around), orbit (also up and down), swing, fixed, or reference (the input's own camera).",
     )
     azimuth: float | None = setting(
         None, "Azimuth of the camera, degrees; 0 is at +z, positive toward +x; none: the reference camera's."
@@ -39,7 +39,7 @@ class RenderSettings:
     fps: float | None = setting(
         None, "Pictures per second; none: the clip's own rate, or a multiple of it.", least=1, most=120
     )
-    time: float | None = setting(None, "Second at which the clip stands still; none: it plays, looped.")
+    time: float | None = setting(None, "Second at which the clip is frozen; none: it plays in a loop.")
     color: Color = setting(
         "appearance", "What the colors show: the object's own, its parts, the rigid weight, or depth."
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-DEFAULT_RADIUS = 2.0  # of a camera nobody knows: what Zero123-type models assume (SC4D, DreamGaussian)
+DEFAULT_RADIUS = 2.0  # of an unknown camera: what Zero123-type models assume (SC4D, DreamGaussian)
 DEFAULT_FOVY = np.deg2rad(49.1)
 
 

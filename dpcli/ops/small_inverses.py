@@ -158,7 +158,7 @@ def _cholesky_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
         m = m + torch.diag_embed(lift[..., None].expand(m.shape[:-1]))
     finite = m.isfinite().all(-1).all(-1)[..., None, None]
     known = torch.where(finite, m, torch.eye(m.shape[-1], dtype=m.dtype, device=m.device))
-    # what isn't finite stays so, as in the closed form: whoever trains notices a loss, not an error from here
+    # what isn't finite stays so, as in the closed form: it shows in the loss instead of raising an error here
     return torch.where(finite, torch.cholesky_inverse(torch.linalg.cholesky(known)), torch.nan)
 
 

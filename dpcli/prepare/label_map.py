@@ -49,7 +49,7 @@ class LabelMap:
                 raise DataError(f"{path}: {key} is {content[key]!r}, expected a {'list' if kind is list else 'table'}")
         tables = [content.get("labels", {}), *content.get("files", {}).values()]
         if any(not isinstance(t, dict) or any(not isinstance(v, str) for v in t.values()) for t in tables):
-            raise DataError(f'{path}: a class is mapped to something that is no name; expected "old" = "new"')
+            raise DataError(f'{path}: a class is mapped to something that is not a name; expected "old" = "new"')
         classes = content.get("classes", [])
         if not all(isinstance(one, str) and one for one in classes) or len(set(classes)) < len(classes):
             raise DataError(f"{path}: classes {classes!r:.80}; expected names, each once")

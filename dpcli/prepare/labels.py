@@ -75,7 +75,7 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     short = [name for name, own in parts.items() if len(own) < least]
     if short:
         raise DataError(
-            f"{root}: {short[0]!r} lies in no folder of its class; --label-from-folder expects {layout}, or"
+            f"{root}: {short[0]!r} is in no folder of its class; --label-from-folder expects {layout}, or"
             f" train/{layout} and test/{layout}, below what is given"
         )
     deep = [name for name, own in parts.items() if split_called(own[0]) and len(own) > least]
@@ -121,7 +121,7 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     else:
         log.warn(
             f"{root}: the classes are {first_names(sorted(below))}; the folders below are the same in each ({listed}): if those"
-            " are the classes, say so in a table (--labels)"
+            " are the classes, give them in a table (--labels)"
         )
 
 

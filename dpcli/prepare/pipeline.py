@@ -178,7 +178,7 @@ def convert(
     ended.
 
     executor: where items are read, `slots` at a time, instead of processes on this machine; the file's bytes don't
-    depend on it. resume: off where nobody could run it again (a pipe); saves the journal's disk space. Raises
+    depend on it. resume: off where it can't be run again (a pipe); saves the journal's disk space. Raises
     UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
     after a stop signal, with what is done kept beside `output`.
     """

@@ -32,7 +32,7 @@ from dpcli.text_files import read_toml
 
 RECIPES = Path(__file__).resolve().parents[1] / "data_recipes"  # a link to the top folder; in a package a copy
 _KEYS = {"path", "what", "count", "each", "bytes", "optional", "instead_of"}
-_OWN = ("clouds", "depth")  # commands for files that nobody published
+_OWN = ("clouds", "depth")  # commands for a user's own files
 _MADE = ("gestures", "articulated", "streets")
 _SHOWN = 10
 

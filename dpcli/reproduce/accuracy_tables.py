@@ -153,10 +153,10 @@ class Plan:
         )
 
 
-def too_short(clouds: Path, words: Sequence[str], split: str = "test") -> int:
-    """Returns how many of a split's videos have fewer frames than a clip."""
+def too_short(clouds: Path, words: Sequence[str]) -> int:
+    """Returns how many test videos have fewer frames than a clip."""
     with CloudsReader(clouds) as reader:
-        counts = reader.frame_counts[[i for i, name in enumerate(reader.splits) if name == split]]
+        counts = reader.frame_counts[[i for i, name in enumerate(reader.splits) if name == "test"]]
     return int((counts < int(words[words.index("--frames") + 1])).sum())
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.classify.presets import PRESETS
+from dpcli.draw.sheet import save_figure
 from dpcli.reproduce.accuracy_tables import prepared
 from dpcli.reproduce.runs import (
     DASH,
@@ -203,8 +204,7 @@ def picture(found: Found, path: Path) -> None:
         axes.set(title=SWEEPS[key].title, ylabel="dynamic stream, accuracy (%)")
         axes.grid(axis="y", color="0.9")
     figure.suptitle("Orange: the thesis's choice")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120, format="png")
+    save_figure(figure, path, 120)
 
 
 def make(
@@ -221,6 +221,7 @@ def make(
 
     words: preset, budget. Shown and returned are the other folds' networks, too, as far as another job has finished them.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     everyone = [Fold(which, folds, clouds, folder, tuple(words)) for which in range(folds)]
     about = f"Ours: `dpc classify train {' '.join(words)}`, {folds} folds of the training videos, one seed, the last epoch.{note}"
 

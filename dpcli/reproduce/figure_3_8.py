@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli import __version__
+from dpcli.draw.sheet import save_figure
 from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, prepared
 from dpcli.reproduce.runs import (
     DASH,
@@ -215,8 +216,7 @@ def picture(cost: Mapping[str, dict[str, Cost]], found: Found, path: Path) -> No
     )
     axes.grid(color="0.92")
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120, format="png")
+    save_figure(figure, path, 120)
 
 
 def _about(plan: Plan, flow: str, reasons: Mapping[str, str]) -> list[str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import save_figure
 from dpcli.errors import DataError
 from dpcli.evaluate.classification.metrics import predicted_labels
 from dpcli.reproduce.runs import DASH, markdown, some, write_json, write_text
@@ -36,30 +37,23 @@ def recalls(scores: np.ndarray, labels: np.ndarray, classes: int) -> np.ndarray:
         return 100 * right / count
 
 
-def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str], list[str]]:
-    """Returns the recall of each class of the test videos, class names, the videos' names."""
+def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str]]:
+    """Returns the recall of each class of the test videos, and the class names."""
     reader = ScoresReader(path)
     if stream is not None and stream not in reader.streams:
         raise DataError(f"{path}: no stream {stream!r}; the file has {', '.join(reader.streams) or 'none'}")
     scores = reader.scores if stream is None else reader.streams[stream]
     test = np.array([split in ("test", "") for split in reader.splits]) & (reader.labels >= 0)
-    names = [name for name, own in zip(reader.names, test) if own]
-    return recalls(scores[test], reader.labels[test], len(reader.class_names)), reader.class_names, sorted(names)
+    return recalls(scores[test], reader.labels[test], len(reader.class_names)), reader.class_names
 
 
-def gains(files: Sequence[Path], static: Sequence[Path] | None = None) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns class names, static recall and gain of the final score over it, percentage points f64 (C), means over files.
-
-    static: where the static stream's scores are, `files` themselves by default, in the same order.
-    """
+def gains(files: Sequence[Path]) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Returns class names, static recall and gain of the final score over it, percentage points f64 (C), means over files."""
     before, after = [], []
-    for path, base in zip(files, static or files, strict=True):
-        own, names, videos = _of(base, "static")
-        new, others, same = _of(path)
-        if names != others or videos != same:
-            raise DataError(f"{path}: other classes or videos than {base}; predict both on the same file of clouds")
+    for path in files:
+        own, names = _of(path, "static")
         before.append(own)
-        after.append(new)
+        after.append(_of(path)[0])
     return names, np.mean(before, 0), np.mean(after, 0) - np.mean(before, 0)
 
 
@@ -101,8 +95,7 @@ def picture(names: Sequence[str], found: Mapping[str, np.ndarray], path: Path) -
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set_xticks(range(len(known)), [names[k] for k in known], rotation=60, ha="right", fontsize=8)
         axes.set(title=TITLES[key], ylabel="gain, percentage points")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120, format="png")
+    save_figure(figure, path, 120)
 
 
 def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict[str, np.ndarray]:

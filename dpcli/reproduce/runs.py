@@ -235,6 +235,16 @@ def thesis_rows(number: str) -> tuple[dict, ...]:
     return next(table.rows for table in thesis_tables() if table.number == number)
 
 
+def thesis_numbers(number: str, ending: str = "") -> dict[str, list]:
+    """Returns the values that a table of the thesis has for each method, by method and supervision: `network, unsupervised`.
+
+    ending: of the settings that count; what follows the supervision in a setting, such as a data set, is left out.
+    """
+    rows = [row for row in thesis_rows(number) if row["setting"].endswith(ending)]
+    names = ("network" if row.get("own") else row["method"] for row in rows)
+    return {f"{name}, {row['setting'].partition(',')[0]}": row["values"] for name, row in zip(names, rows)}
+
+
 def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Returns a markdown table."""
     lines = [header, ["---"] * len(header), *rows]

@@ -40,16 +40,15 @@ def recording(reader: CloudsReader, chosen: list[int], name: str, pause: int) ->
     return CloudSequence.from_frames(name, frames), truth
 
 
-def write_recordings(clouds: Path, folder: Path, pause: int, seed: int, subjects: set[int] | None = None) -> None:
-    """Writes folder/clouds.h5 and folder/truth.csv: a recording of each person of the test split, or of `subjects`."""
+def write_recordings(clouds: Path, folder: Path, pause: int, seed: int) -> None:
+    """Writes folder/clouds.h5 and folder/truth.csv: a recording of each person of the test split."""
     folder.mkdir(parents=True, exist_ok=True)
     truth = Segments({})
     with CloudsReader(clouds) as reader:
         people: dict[int, list[int]] = {}
         for i, split in enumerate(reader.splits):
-            person = int(reader.subjects[i])
-            if person in subjects if subjects else split == "test":
-                people.setdefault(person, []).append(i)
+            if split == "test":
+                people.setdefault(int(reader.subjects[i]), []).append(i)
         with CloudsWriter(
             folder / "clouds.h5",
             class_names=reader.class_names,

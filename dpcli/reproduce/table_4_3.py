@@ -18,14 +18,6 @@ from dpcli.reproduce import runs
 METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 VIEWS = {"full": ("ogc-dr", "OGC-DR"), "single view": ("ogc-drsv", "OGC-DRSV")}
 METHODS = ("multibody", "network", "ssc", "trajaffn", "ward", "dbscan")
-THESIS = {  # percent, full / single view, by METRICS
-    "trajaffn": ((42.6, 46.7, 57.8, 69.6, 49.4, 46.8, 80.1), (39.3, 43.8, 54.8, 63.0, 48.4, 45.9, 77.7)),
-    "ssc": ((74.5, 79.2, 84.2, 92.5, 77.3, 74.6, 91.5), (70.3, 75.4, 81.5, 89.6, 74.7, 70.8, 91.3)),
-    "ward": ((72.3, 74.0, 82.5, 93.9, 73.6, 69.9, 94.3), (69.8, 71.6, 80.5, 91.8, 71.7, 67.2, 93.3)),
-    "dbscan": ((73.9, 76.0, 81.6, 85.8, 77.8, 74.7, 91.5), (71.9, 76.3, 81.8, 79.1, 84.8, 80.1, 93.5)),
-    "OGC": ((92.3, 85.1, 89.4, 85.6, 93.6, 90.8, 97.8), (86.8, 77.0, 83.9, 77.7, 91.2, 84.8, 95.4)),
-    "the thesis's network": ((93.9, 87.0, 91.1, 87.0, 95.6, 92.4, 98.1), (88.1, 80.0, 86.1, 80.8, 92.2, 86.7, 96.6)),
-}
 
 
 def prepare(view: str, options: argparse.Namespace) -> Path:
@@ -63,7 +55,7 @@ def score(
     return runs.once(parts.with_suffix(".json"), key, work)
 
 
-def rows(results: dict[str, dict], thesis: dict[str, tuple[float, ...]]) -> list[str]:
+def rows(results: dict[str, dict], thesis: dict[str, list[float]]) -> list[str]:
     """Returns lines of Markdown, percent: our methods with the interval of AP, then the thesis's numbers."""
     lines = ["| |" + "|".join(f" {name.upper()} " for name in METRICS) + "| AP, 95 % |"]
     lines += ["|---|" + "---|" * (len(METRICS) + 1)]
@@ -84,8 +76,8 @@ def _interval(result: dict) -> str:
 def table(found: dict[str, dict[str, dict]], about: str) -> str:
     """Returns Markdown with a part for each view: our methods, then the thesis's numbers, percent."""
     lines = []
-    for place, (view, by_method) in enumerate(found.items()):
-        thesis = {name: numbers[place] for name, numbers in THESIS.items()}
+    for view, by_method in found.items():
+        thesis = runs.thesis_numbers("4.3", f"unsupervised, {VIEWS[view][1]}")
         lines += [f"## {view}", "", *rows(by_method, thesis), ""]
     return "\n".join([*lines, about, ""])
 

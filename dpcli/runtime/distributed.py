@@ -18,7 +18,7 @@ _LOST = ("Connection closed", "Connection reset", "Broken pipe", "peer", "NCCL",
 
 @dataclass(frozen=True)
 class Processes:
-    """Tells this process's number among `count`; the first one alone writes files and talks."""
+    """Tells this process's number among `count`; only the first one writes files and messages."""
 
     rank: int = 0
     count: int = 1
@@ -26,7 +26,7 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Tells whether this is the process that writes files and talks."""
+        """Tells whether this is the process that writes files and messages."""
         return self.rank == 0
 
     def place(self, device: torch.device) -> torch.device:
@@ -58,7 +58,7 @@ def from_environment() -> Processes:
             )
         )
     except ValueError:
-        raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is no number; start with torchrun, or unset them") from None
+        raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is not a number; start with torchrun, or unset them") from None
 
 
 @contextmanager

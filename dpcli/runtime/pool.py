@@ -36,7 +36,7 @@ _worker = threading.local()  # `apart` where this process is a worker, which may
 def at_most(seconds: float) -> Iterator[None]:
     """Ends this process, a worker of `ordered_map`, when the block takes more seconds of its processor; elsewhere does nothing.
 
-    So a C library that loops for ever costs one item. Time that others take on a busy machine does not count.
+    So a C library that loops forever costs one item. Time that others take on a busy machine does not count.
     """
     if not getattr(_worker, "apart", False) or not hasattr(signal, "setitimer"):
         yield
@@ -62,7 +62,7 @@ def _start_worker(debug: bool) -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this worker when its parent was killed and can't tell it to; it would wait for work for ever."""
+    """Ends this worker when its parent was killed and can't tell it to; it would wait for work forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -70,7 +70,7 @@ def _end_with_parent() -> None:
 
 
 class Worker(ForkServerProcess):
-    """Ends when its executor says so, although it ignores SIGTERM, which whoever stops a batch job sends to all processes."""
+    """Ends when its executor says so, although it ignores SIGTERM, which a batch system sends to all processes."""
 
     def terminate(self) -> None:
         """Ends the process. From Python 3.12 on a broken executor holds a lock until its processes ended."""
@@ -89,13 +89,13 @@ def _new_pool(jobs: int) -> ProcessPoolExecutor:
     except (OSError, ImportError) as error:
         said = error.strerror if isinstance(error, OSError) else error
         raise DpcError(
-            f"this machine lets processes share no locks, which lie in /dev/shm ({said}); --jobs 1 needs none"
+            f"processes can't share locks on this machine, which needs /dev/shm for them ({said}); --jobs 1 needs none"
         ) from None
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
     try:
-        with regular_files_only():  # in whatever process: a FIFO would hold it for ever
+        with regular_files_only():  # in whatever process: a FIFO would hold it forever
             return function(item)
     except Exception as error:  # an item's failure is a result, so that the caller can skip it
         return error
@@ -106,7 +106,7 @@ class LostWorker(DataError):
 
 
 def _was_lost(error: Exception) -> bool:
-    """Returns whether an executor says that whoever worked on an item died; Dask's class is told by its name, as Dask need not be there."""
+    """Returns whether an executor says that the worker of an item died; Dask's class is recognized by its name, as Dask may be absent."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 
 
@@ -140,7 +140,7 @@ class _Pool:
 
     def result(self, item: Any, future: Future) -> Any:
         """Returns an item's result, or LostWorker as one. What was on its way as a process died is tried again, alone, as
-        nobody can say which item took it down."""
+        it is unknown which item took it down."""
         try:
             return self._unpacked(item, _awaited(future, self._given or self._executor, self._children))
         except Exception as error:
@@ -186,7 +186,7 @@ class _Pool:
 def _awaited(future: Future, executor: Executor, children: set) -> Any:
     """Returns a future's result; ends a pool whose process died while it wrote a result, so that the future breaks.
 
-    The thread of such a pool reads on, and would wait for the rest for ever: `executor` itself has the pipe open, too.
+    The thread of such a pool reads on, and would wait for the rest forever: `executor` itself has the pipe open, too.
     """
     dead_before = False
     while True:
@@ -202,13 +202,13 @@ def _awaited(future: Future, executor: Executor, children: set) -> Any:
 
 
 def _end(children: Iterable) -> None:
-    """Ends the processes of a broken executor, which sends them SIGTERM, which they ignore, and would wait for them for ever."""
+    """Ends the processes of a broken executor, which sends them SIGTERM, which they ignore, and would wait for them forever."""
     for child in children:
         child.kill()
 
 
 def _signal_of(children: list) -> str:
-    """Returns the name of the signal that ended one of some processes, "" where none did or nobody can say."""
+    """Returns the name of the signal that ended one of some processes, "" where none did or it is unknown."""
     codes = [child.exitcode for child in children]
     return next((signal.Signals(-code).name for code in codes if code and code < 0), "")
 

@@ -71,7 +71,7 @@ def diverged(problem: str, where: str, remedy: str) -> DpcError:
 class RunFolder:
     """Keeps what a training run writes into its folder, and guards the folder against other runs.
 
-    It holds `config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`,
+    It holds `config.json`, `settings.toml`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`,
     `curves.png`.
 
     columns: what a row of the log holds. curves: draws the rows into a picture file. Only looks until it is entered (`with`):
@@ -138,7 +138,7 @@ class RunFolder:
             left = [name for name in _FILES if (self.path / name).exists()]
             if left:
                 raise UsageError(
-                    f"{self.path}: holds {', '.join(left)}, but no config.json that says of which run;"
+                    f"{self.path}: holds {', '.join(left)}, but no config.json that says which run they belong to;"
                     " use another -o, or --force to replace them"
                 )
             return False
@@ -158,9 +158,7 @@ class RunFolder:
     def refuse_inside(self, option: str, file: Path) -> None:
         """Raises UsageError when `file`, named by an option to start from, is among those that the run replaces."""
         if self.path.resolve() in (file.parent.resolve(), file.resolve().parent):
-            raise UsageError(
-                f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o"
-            )
+            raise UsageError(f"{option} {file}: is in the folder of -o, whose files this run replaces; use another -o")
 
     def file(self, name: str) -> Path:
         """Returns the path of a file of the run."""
@@ -207,6 +205,10 @@ class RunFolder:
             writer.writeheader()
             writer.writerows(self.rows)
 
+    def write_settings(self, text: str) -> None:
+        """Writes the resolved settings as `settings.toml`, which `--config` reads back."""
+        _replace(self.path / "settings.toml", text)
+
     def draw_curves(self) -> None:
         """Draws the learning curves so far, by the function given."""
         if self.rows and self.curves is not None:
@@ -215,4 +217,4 @@ class RunFolder:
 
 def _replace(path: Path, text: str) -> None:
     with whole_file(path) as part:
-        part.write_text(text)
+        part.write_text(text, encoding="utf-8")

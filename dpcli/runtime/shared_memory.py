@@ -19,7 +19,7 @@ import numpy as np
 _SMALL = 256 << 10  # bytes; below, a pipe is as fast
 _HEAD = 64  # bytes: whether it is in use, and a mark that says which result it holds
 _FREE, _USED = b"\0", b"\1"
-_MOST = 8  # memory files of one worker; whoever keeps more results than that gets copies
+_MOST = 8  # memory files of one worker; a parent that keeps more results than that gets copies
 _SPARE = 2
 POSSIBLE = hasattr(os, "memfd_create") and os.path.isdir("/proc/self/fd")
 
@@ -65,7 +65,7 @@ class _MemoryFiles:
         self._process = 0
 
     def take(self) -> _MemoryFile | None:
-        """Returns one that nobody reads; None when there are too many."""
+        """Returns one that is not being read; None when there are too many."""
         if self._process != os.getpid():  # after a fork they are another's
             self._files, self._process = [], os.getpid()
         free = [file for file in self._files if not file.in_use()]

@@ -32,7 +32,7 @@ def tune_environment() -> None:
 def keep_freed_memory() -> None:
     """Lets the C library keep freed blocks for the next training step instead of returning them to the system.
 
-    A step frees and takes the same hundreds of megabytes again; without this every page is faulted in and zeroed anew.
+    A step frees and takes the same hundreds of megabytes again; without this every page is faulted in and zeroed again.
     A static step of twelve clips took 1.04 times the processor time without it (DGCNN quick 1.00, PointNet++ thesis 1.05).
     Does nothing where the C library is not glibc.
     """

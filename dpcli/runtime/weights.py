@@ -193,7 +193,7 @@ def _named(path: Path) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        raise DataError(f"{path}: {error}; copy it again, or make it anew") from None
+        raise DataError(f"{path}: {error}; copy it again, or make it again") from None
 
 
 def weights_summary(path: Path) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def disk_full(
     """Returns the error that a failed write to `path` ends with when the disk was full, None for any other failure.
 
     `error` is what the write raised; what it was raised from is looked at, too. `advice` ends the sentence. `place` lies on
-    the disk that is full where `path` itself is no path; None: nobody knows. `needed`: bytes to be written, 0: nobody knows.
+    the disk that is full where `path` itself is no path; None: unknown. `needed`: bytes to be written, 0: unknown.
     """
     while error is not None:
         told = _IN_TEXT.search(str(error))
@@ -52,7 +52,7 @@ def disk_full(
 
 
 def _room(place: str | Path | None, needed: int) -> str:
-    """Returns how much is needed and how much is free now on the disk of a place, in words; "" where nobody knows."""
+    """Returns how much is needed and how much is free now on the disk of a place, in words; "" where both are unknown."""
     from rich.filesize import decimal
 
     parts = [f"about {decimal(needed)} needed"] if needed else []

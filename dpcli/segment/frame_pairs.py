@@ -119,7 +119,7 @@ class PairSource:
         """Returns the true flow (2,N,3) of the chosen points, each way."""
         if sample.pose is not None:
             if not (np.isfinite(sample.pose).all() and np.linalg.det(sample.pose).all()):
-                raise DataError(f"{sample.name}: a pose is no rigid motion: its matrix has no inverse")
+                raise DataError(f"{sample.name}: a pose is not a rigid motion: its matrix has no inverse")
             return np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
         if sample.scene_flow is None:
             return None

@@ -1,4 +1,4 @@
-"""Parts in color: a contact sheet of sequences, predictions above the truth, and an object on a turntable."""
+"""Parts in color: a contact sheet of sequences, and an object on a turntable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.draw.animation import write_pictures
-from dpcli.draw.palette import DARK, LIGHT, Theme, part_colors
+from dpcli.draw.palette import LIGHT, part_colors
 from dpcli.draw.points import Raster, draw_balls
 from dpcli.draw.sheet import save_picture, spread_evenly, text_font, write_line
 from dpcli.draw.view import turntable_view
@@ -28,75 +28,33 @@ class Look:
     """Holds how parts are drawn.
 
     cell: pixels of a picture's side. up: the axis that points upwards, such as z or -y. azimuth, elevation: of the
-    camera, radians. dark: on a dark background.
+    camera, radians.
     """
 
     cell: int = 200
     up: str = "z"
     azimuth: float = _AZIMUTH
     elevation: float = _ELEVATION
-    dark: bool = False
 
     def __post_init__(self) -> None:
         if self.up not in ("x", "y", "z", "-x", "-y", "-z"):
             raise UsageError(f"up axis {self.up!r}: expected x, y, z, -x, -y or -z")
 
-    @property
-    def theme(self) -> Theme:
-        """Returns the colors of the ground and of letters."""
-        return DARK if self.dark else LIGHT
 
-
-def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Returns `found` i64 (N) renamed after the true parts it covers, so that colors agree.
-
-    Parts are paired such that the sum of IoU is largest; those left over take ids beyond the true ones; -1 stays.
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    found, truth = np.asarray(found, np.int64), np.asarray(truth, np.int64)
-    shared = np.zeros((found.max(initial=-1) + 2, truth.max(initial=-1) + 2))  # the last row and column: unknown
-    np.add.at(shared, (found, truth), 1)
-    union = shared.sum(1, keepdims=True) + shared.sum(0) - shared
-    iou = (shared / np.maximum(union, 1))[:-1, :-1]
-    rows, columns = linear_sum_assignment(-iou)
-    names = np.full(len(shared), -1)
-    good = iou[rows, columns] > 0
-    names[rows[good]] = columns[good]
-    spare = np.flatnonzero((names[:-1] < 0) & (shared[:-1].sum(1) > 0))
-    names[spare] = iou.shape[1] + np.arange(len(spare))
-    return names[found]
-
-
-def parts_picture(
-    path: Path,
-    sequences: Sequence[CloudSequence],
-    *,
-    truth: Sequence[CloudSequence | None] | None = None,
-    titles: Sequence[str] | None = None,
-    frames: int = 4,
-    look: Look | None = None,
-) -> None:
+def parts_picture(path: Path, sequences: Sequence[CloudSequence], *, frames: int = 4, look: Look | None = None) -> None:
     """Writes a contact sheet: a row per sequence, its frames as columns, points colored by `part`.
 
-    truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colors.
-    At most `frames` frames are shown, spread over the sequence. Raises DataError on sequences without parts, truth of other
-    size, or when the picture can't be written.
+    At most `frames` frames are shown, spread over the sequence. Raises DataError on sequences without parts, or when the
+    picture can't be written.
     """
     if not sequences:
         raise DataError(f"{path}: no sequences to draw")
     look = look or Look()
     rows = []
-    for index, sequence in enumerate(sequences):
-        real = truth[index] if truth is not None else None
-        found = _parts_of(sequence)
-        title = titles[index] if titles is not None else sequence.name
-        if real is not None:
-            found = matched_ids(found, _true_parts(sequence, real))
+    for sequence in sequences:
+        part = _parts_of(sequence)
         shown = spread_evenly(sequence.num_frames, frames)
-        rows.append((title, found, _draw_row(sequence, found, shown, look)))
-        if real is not None:
-            rows.append(("truth", real.part, _draw_row(sequence, real.part, shown, look)))
+        rows.append((sequence.name, part, _draw_row(sequence, part, shown, look)))
     save_picture(_assemble(rows, look), path)
 
 
@@ -104,13 +62,6 @@ def _parts_of(sequence: CloudSequence) -> np.ndarray:
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to draw; `dpc segment predict` finds them")
     return sequence.part
-
-
-def _true_parts(sequence: CloudSequence, real: CloudSequence) -> np.ndarray:
-    part = _parts_of(real)
-    if len(part) != len(sequence.points):
-        raise DataError(f"sample {sequence.name!r} has {len(sequence.points)} points, its truth {len(part)}")
-    return part
 
 
 def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look: Look) -> list[np.ndarray]:
@@ -122,7 +73,7 @@ def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look:
     offsets, colors = sequence.frame_offsets, part_colors(part)
     spans = [slice(offsets[t], offsets[t + 1]) for t in shown]
     raster, depth = Raster(look.cell, look.cell, (low + high)[:2] / 2, scale), (float(low[2]), float(high[2]))
-    return [draw_balls(seen[span], colors[span], raster, look.theme.background, depth) for span in spans]
+    return [draw_balls(seen[span], colors[span], raster, LIGHT.background, depth) for span in spans]
 
 
 def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) -> Any:
@@ -130,18 +81,18 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) 
 
     columns = max(len(cells) for _, _, cells in rows)
     step = look.cell + _TITLE
-    sheet = Image.new("RGB", (columns * look.cell + 2 * _GAP, len(rows) * step + 2 * _GAP), look.theme.background)
+    sheet = Image.new("RGB", (columns * look.cell + 2 * _GAP, len(rows) * step + 2 * _GAP), LIGHT.background)
     draw = ImageDraw.Draw(sheet)
     for place, (title, part, cells) in enumerate(rows):
         top = _GAP + place * step
-        room = _legend(draw, top, sheet.width - _GAP, part, look)
-        write_line(draw, (_GAP, top + 3), title, room - 2 * _GAP, look.theme.ink)
+        room = _legend(draw, top, sheet.width - _GAP, part)
+        write_line(draw, (_GAP, top + 3), title, room - 2 * _GAP, LIGHT.ink)
         for column, cell in enumerate(cells):
             sheet.paste(Image.fromarray(cell), (_GAP + column * look.cell, top + _TITLE))
     return sheet
 
 
-def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> int:
+def _legend(draw: Any, top: int, right: int, part: np.ndarray) -> int:
     """Draws swatches of the parts with their share of the points, right-aligned, on half the row; returns where they start."""
     ids, counts = np.unique(part, return_counts=True)
     font, start, left = text_font(11), right // 2, right
@@ -149,12 +100,12 @@ def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> in
         text = f"{'?' if own < 0 else own}: {100 * count / len(part):.0f} %"
         width = int(draw.textlength(text, font=font)) + 20
         if left - width < start:
-            draw.text((left - 14, top + 4), "…", fill=look.theme.ink, font=font)
+            draw.text((left - 14, top + 4), "…", fill=LIGHT.ink, font=font)
             return left - 14
         left -= width
         color = tuple(part_colors(np.array([own]))[0].tolist())
         draw.ellipse((left, top + 6, left + 9, top + 15), fill=color)
-        draw.text((left + 13, top + 4), text, fill=look.theme.ink, font=font)
+        draw.text((left + 13, top + 4), text, fill=LIGHT.ink, font=font)
     return left
 
 
@@ -177,7 +128,7 @@ def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look
         matrix = turntable_view(look.azimuth + 2 * np.pi * image / count, look.elevation, look.up)
         span = slice(offsets[t], offsets[t + 1])
         seen = centered[span] @ matrix.T
-        images.append(draw_balls(seen, colors[span], raster, look.theme.background, (-radius, radius)))
+        images.append(draw_balls(seen, colors[span], raster, LIGHT.background, (-radius, radius)))
     write_pictures(path, images, _RATE, force=True)
 
 

@@ -1,7 +1,7 @@
 """The HDF5 contract: what a file holds, writing it whole, reading only what is needed, moving it through pipes.
 
-`CloudsWriter` / `CloudsReader` for point cloud sequences, `PartsWriter` / `PartsReader` for what a segmenter says,
-`ScoresWriter` / `ScoresReader` for what a classifier says, `ViewsWriter` / `ViewsReader` for an object in pictures,
+`CloudsWriter` / `CloudsReader` for point cloud sequences, `PartsWriter` / `PartsReader` for the output of segmentation,
+`ScoresWriter` / `ScoresReader` for the output of a classifier, `ViewsWriter` / `ViewsReader` for an object in pictures,
 `input_file` / `output_file` for paths and `-`. Nothing here knows where samples come from or what they are for.
 Names resolve on first use: a process that only makes `CloudSequence`s needs no HDF5.
 """

@@ -10,7 +10,15 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, reading
-from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.store.file import (
+    absent,
+    open_store,
+    read_positions,
+    read_provenance,
+    read_skipped,
+    read_strings,
+    root_attributes,
+)
 from dpcli.store.schema import KEPT
 from dpcli.store.sequence import NO_LENGTHS, OF_PARTS, POINT_FIELDS, CloudSequence, are_lengths
 
@@ -59,7 +67,7 @@ class CloudsReader:
         if len(set(self.names)) != len(self.names):
             twice = next(name for k, name in enumerate(self.names) if name in self.names[:k])
             raise DataError(
-                f"{self.path}: the name {twice!r} is there twice; names identify samples, make the file again"
+                f"{self.path}: the name {twice!r} occurs twice; names identify samples, make the file again"
             )
         if self.class_names and len(self.labels) and self.labels.max() >= len(self.class_names):
             worst = int(self.labels.argmax())
@@ -79,7 +87,7 @@ class CloudsReader:
 
     def _data(self, file: h5py.File, name: str, tail: tuple[int, ...]) -> h5py.Dataset:
         if name not in file:
-            raise DataError(f"{self.path}: data set {name!r} is missing; the file is incomplete, make it again")
+            raise absent(self.path, name)
         if file[name].shape[1:] != tail:
             raise DataError(
                 f"{self.path}: {name} has shape {file[name].shape}, expected (n{''.join(f', {d}' for d in tail)})"

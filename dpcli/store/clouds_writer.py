@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING
+from dpcli.store.file import PACKED, STRING
 from dpcli.store.schema import KEPT, fields_of
 from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
@@ -20,7 +20,6 @@ from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
-PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _FIELD = fields_of("clouds")
 _PER_SAMPLE = {
     name: STRING if field.kind == "str" else field.dtype
@@ -28,7 +27,7 @@ _PER_SAMPLE = {
     if field.shape == ("S",) and not field.optional
 }
 _INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
-_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, whoever names them: equal bytes
+_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, however they are named: equal bytes
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 
@@ -38,7 +37,7 @@ class CloudsWriter(ResumableWriter):
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
     `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, joint, and kept columns,
-    `field_NAME`); a shift is written where a sample has one.
+    `field_NAME`); a shift is written where a sample has one. options: those of `ResumableWriter`.
 
     >>> from dpcli.store import CloudSequence, CloudsReader
     >>> with CloudsWriter("two.h5", class_names=["wave"]) as writer:
@@ -56,15 +55,10 @@ class CloudsWriter(ResumableWriter):
         self,
         path: str | Path,
         *,
-        class_names: Sequence[str] = (),
         length_unit: str = "m",
-        source: str = "",
-        seed: int = 0,
         fields: Sequence[str] = (),
         compression: str = "none",
-        provenance: dict | Sequence[dict] | None = None,
-        force: bool = False,
-        resume: bool = False,
+        **options: Any,
     ) -> None:
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
@@ -80,16 +74,7 @@ class CloudsWriter(ResumableWriter):
         self._data: dict[str, h5py.Dataset] = {}
         self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
+        super().__init__(path, length_unit=length_unit, **options)
 
     def _create(self) -> None:
         file = self._file

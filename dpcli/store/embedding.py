@@ -10,12 +10,20 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.runtime.whole_file import refuse_existing
-from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import (
+    PACKED,
+    absent,
+    open_store,
+    read_provenance,
+    read_strings,
+    root_attributes,
+    write_root,
+    write_strings,
+)
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
 
 _FIELD = fields_of("embedding")
-_PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 @dataclass
@@ -47,9 +55,9 @@ def write_embedding(
         write_root(
             file, "embedding", length_unit="", source=source, seed=seed, class_names=class_names, provenance=provenance
         )
-        file.create_dataset("name", data=np.array(list(names), dtype=object), dtype=STRING)
-        file.create_dataset("split", data=np.array(list(splits), dtype=object), dtype=STRING)
-        file.create_dataset("label", data=np.asarray(labels, _FIELD["label"].dtype), **_PACKED)
+        write_strings(file, "name", list(names))
+        write_strings(file, "split", list(splits))
+        file.create_dataset("label", data=np.asarray(labels, _FIELD["label"].dtype), **PACKED)
         for stream, said in streams.items():
             file.create_dataset(f"features/{stream}", data=said.features)
             file.create_dataset(f"coordinates/{stream}", data=said.coordinates).attrs.update(said.values)
@@ -88,7 +96,7 @@ class EmbeddingReader:
             self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
             for key in ("label", "features", "coordinates"):
                 if key not in file:
-                    raise DataError(f"{path}: {key!r} is missing; the file is incomplete, make it again")
+                    raise absent(path, key)
             self.labels = file["label"][:]
             if set(file["features"]) != set(file["coordinates"]):
                 raise DataError(

@@ -17,7 +17,7 @@ from dpcli.runtime.whole_file import refuse_folder, refuse_pipe
 from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
+MAGIC = b"\x89HDF\r\n\x1a\n"
 _TEXT = np.dtype([("length", "<u4"), ("heap", "<u8"), ("number", "<u4")])  # what stands for a text of variable length
 _AT_ONCE = 1 << 16
 _PACKED_AT_MOST = 1100  # times that zlib makes anything smaller: 258 bytes in 2 bits, and headers
@@ -26,6 +26,7 @@ _CHUNK = 1 << 26  # bytes that a chunk of any data set may have
 _TEXTS = ("dpc_version", "command", "source", "length_unit", "name", "metrics")  # attributes, by what they hold
 _NUMBERS = ("seed", "skipped", "reference", "num_parts", "num_points")
 STRING = h5py.string_dtype("utf-8")
+PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}  # of labels, offsets and pictures
 
 _FROM_RAW = "`dpc prepare` makes them from raw data"
 _CACHE = 1 << 20  # bytes, HDF5's own choice
@@ -55,7 +56,7 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
         magic = raw.read(8)
     if not magic:
         raise DataError(f"{path}: the file is empty, expected HDF5; did the command that writes it fail?")
-    if magic != _MAGIC:
+    if magic != MAGIC:
         makers = [f"dpcli.store.{kind.capitalize()}Writer" for kind in kinds if kind in ("scores", "parts")]
         made = f"what another program predicted, {makers[0]} writes" if len(kinds) == len(makers) else _FROM_RAW
         raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); {made}")
@@ -109,7 +110,7 @@ def _is_utf8(text: str) -> bool:
 def _refuse_outside(file: h5py.File, path: Path) -> None:
     """Raises DataError for what lies outside the file, or is no number and no text: hostile files could name others, or pickles.
 
-    Also for many objects, and for one under several names: groups that hold each other twice would be looked at for ever.
+    Also for many objects, and for one under several names: groups that hold each other twice would be looked at forever.
     """
     seen = {h5py.h5o.get_info(file.id).addr}
 
@@ -210,6 +211,12 @@ def _holds(item: h5py.Group | h5py.Dataset, field: Field) -> bool:
     return right and all(isinstance(there, str) or there == here for there, here in zip(field.shape, item.shape))
 
 
+def is_hdf5(path: Path) -> bool:
+    """Returns whether a file begins as HDF5 does."""
+    with open(path, "rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
 def file_kind(path: str | Path) -> str:
     """Returns the kind of a file of the contract, such as `clouds`; DataError as `open_store`."""
     with open_store(path) as file:
@@ -247,7 +254,7 @@ def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
         return
     clean = [[text.encode("utf-8", "replace").decode().replace("\0", " ") for text in row] for row in skipped]
     file.attrs["skipped"] = len(clean)
-    file.create_dataset("skipped", data=np.array(clean, dtype=object), dtype=STRING)
+    write_strings(file, "skipped", clean)
 
 
 def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
@@ -282,11 +289,26 @@ def read_strings(file: h5py.File, name: str, *, optional: bool = False) -> list[
     if name not in file:
         if optional:
             return []
-        raise DataError(f"{file.filename}: data set {name!r} is missing; the file is incomplete, make it again")
+        raise absent(file.filename, name)
     try:
         return list(file[name].asstr()[:])
     except UnicodeDecodeError:
         raise DataError(f"{file.filename}: {name!r} is not UTF-8; the file was changed by another program") from None
+
+
+def absent(path: str | Path, name: str) -> DataError:
+    """Returns the error for a data set that a file should have."""
+    return DataError(f"{path}: data set {name!r} is missing; the file is incomplete, make it again")
+
+
+def write_strings(file: h5py.File, name: str, texts: Sequence) -> None:
+    """Writes texts, or rows of texts, as a data set."""
+    file.create_dataset(name, data=np.array(texts, dtype=object), dtype=STRING)
+
+
+def history_of(provenance: dict | Sequence[dict] | None) -> list[dict]:
+    """Returns provenance as a list of entries; one entry, or none, may be given by itself."""
+    return [provenance] if isinstance(provenance, dict) else list(provenance or [])
 
 
 def write_root(
@@ -320,6 +342,5 @@ def write_root(
             "length_unit": length_unit,
         }
     )
-    file.create_dataset("class_names", data=np.array(list(class_names), dtype=object), dtype=STRING)
-    entries = [json.dumps(entry, sort_keys=True) for entry in provenance]
-    file.create_dataset("provenance", data=np.array(entries, dtype=object), dtype=STRING)
+    write_strings(file, "class_names", list(class_names))
+    write_strings(file, "provenance", [json.dumps(entry, sort_keys=True) for entry in provenance])

@@ -13,7 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.runtime.whole_file import refuse_existing
-from dpcli.store.file import open_store, read_provenance, root_attributes, write_root
+from dpcli.store.file import PACKED, history_of, open_store, read_provenance, root_attributes, write_root
 from dpcli.store.schema import TABLES
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.text_files import parse_json
@@ -21,7 +21,6 @@ from dpcli.text_files import parse_json
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _LARGEST_LOG_SCALE = 40  # so that a scale, and its square in a covariance, stay finite in float32
 _TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
-_PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
 LAYOUT = {field.name: (field.dtype, field.shape) for field in TABLES["gaussians"]}  # data set -> type, shape
 _QUATERNIONS = ("quaternion", "frame_quaternion", "control_quaternion")
@@ -228,7 +227,7 @@ def write_scene(
     """Writes a scene whole or not at all. Raises UsageError when `path` exists and `force` is off; DataError as `validate`."""
     refuse_existing(path, force)
     scene.validate(f"{path}")
-    history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
+    history = history_of(provenance)
     with AtomicFile(path) as file:
         write_root(
             file, "gaussians", length_unit=length_unit, source=source, seed=seed, class_names=[], provenance=history
@@ -242,7 +241,7 @@ def _write_arrays(file: h5py.File, scene: GaussianScene) -> None:
     for key in LAYOUT:
         value = getattr(scene, key)
         small = value.dtype.kind == "i" and value.size  # labels pack well, coordinates hardly
-        file.create_dataset(key, data=value, **(_PACKED if small else {}))
+        file.create_dataset(key, data=value, **(PACKED if small else {}))
 
 
 def read_scene(path: str | Path) -> GaussianScene:

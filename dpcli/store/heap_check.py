@@ -1,4 +1,4 @@
-"""A check of HDF5's heaps of texts before libhdf5 reads them: at one damage it loops for ever, where no signal reaches it."""
+"""A check of HDF5's heaps of texts before libhdf5 reads them: at one damage it loops forever, where no signal reaches it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def check_heaps(path: Path) -> None:
     claims more than the file has.
 
     Also where lengths are not of 8 bytes each, as all of ours and nearly all others are, since heaps would lie otherwise.
-    Files that are not HDF5 pass: whoever opens them says so. Files of more than 128 MiB are searched at both ends only. A
+    Files that are not HDF5 pass: opening them fails with a message. Files of more than 128 MiB are searched at both ends only. A
     file that did not change is searched once.
     """
     state = _state(path)

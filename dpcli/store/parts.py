@@ -1,4 +1,4 @@
-"""Files of kind `parts`: what a segmenter says of the points and frame pairs of each sequence."""
+"""Files of kind `parts`: predictions for the points and frame pairs of each sequence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.clouds_reader import CloudsReader
-from dpcli.store.clouds_writer import PACKED, CloudsWriter
+from dpcli.store.clouds_writer import CloudsWriter
+from dpcli.store.file import PACKED, absent
 from dpcli.store.schema import fields_of
 from dpcli.store.sequence import LONGEST, NO_LENGTHS, CloudSequence, are_lengths
 
@@ -181,7 +182,7 @@ class PartsReader(CloudsReader):
     def _load_index(self, file: h5py.File) -> None:
         super()._load_index(file)
         if "part" not in self.fields:
-            raise DataError(f"{self.path}: data set 'part' is missing; the file is incomplete, make it again")
+            raise absent(self.path, "part")
         probability = file.get("part_probability")
         if probability is None or probability.ndim != 2 or len(probability) != self.num_points:
             found = "is missing" if probability is None else f"has shape {probability.shape}"

@@ -69,7 +69,7 @@ _CLOUDS = (
         "f32",
         ("P", 3),
         "true (or, after `dpc segment estimate-flow`, estimated) displacement of a point to the sequence's next frame,"
-        " in its last frame to the one before; for motion that no `pose` tells (KITTI scene flow)",
+        " in its last frame to the one before; for motion that `pose` does not describe (KITTI scene flow)",
         optional=True,
     ),
     Field(
@@ -92,8 +92,8 @@ _CLOUDS = (
         "shift",
         "f64",
         ("S", 3),
-        "what was taken off the coordinates of a sequence, because float32 can't hold them (maps); add it to its points"
-        " to have the original ones, over any `--scale`. Absent where nothing was",
+        "what was subtracted from the coordinates of a sequence because float32 can't hold them (maps): points plus shift"
+        " are the original coordinates, divided by any `--scale`. Absent where nothing was subtracted",
         optional=True,
     ),
     Field(f"{KEPT}NAME", "f32", ("P",), "a column of the raw data, kept on request (`--keep-fields NAME`)", True),

@@ -1,4 +1,4 @@
-"""Files of kind `scores`: what a classifier says of each sample."""
+"""Files of kind `scores`: a classifier's output for each sample."""
 
 from __future__ import annotations
 
@@ -11,59 +11,40 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store.file import (
-    STRING,
+    PACKED,
+    absent,
     open_store,
     read_positions,
     read_provenance,
     read_skipped,
     read_strings,
     root_attributes,
+    write_strings,
 )
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.resumable_writer import ResumableWriter
 
 _FIELD = fields_of("scores")
-_PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 class ScoresWriter(ResumableWriter):
     """Writes one sample after the other by `write`, as a context manager; the file appears whole when the block ends.
 
     A score row is small (C floats), so rows are kept in memory until the end, as floats alone, and with `resume=True` in
-    the journal, too: see `ResumableWriter`. `streams` names extra score arrays (such as static, dynamic) stored beside the final one.
+    the journal, too: see `ResumableWriter`, whose options it takes. `streams` names extra score arrays (such as static,
+    dynamic) stored beside the final one; `rejects`: the file says of each sample whether nothing was recognized.
     """
 
     kind = "scores"
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        class_names: Sequence[str],
-        seed: int = 0,
-        source: str = "",
-        provenance: dict | Sequence[dict] | None = None,
-        streams: Sequence[str] = (),
-        rejects: bool = False,
-        force: bool = False,
-        resume: bool = False,
-    ) -> None:
+    def __init__(self, path: str | Path, *, streams: Sequence[str] = (), rejects: bool = False, **options: Any) -> None:
         self.streams, self.rejects = tuple(streams), rejects
         self._names: list[str] = []
         self._splits: list[str] = []
         self._labels = array("i")
         self._rejected = array("B")
         self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit="",
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
+        super().__init__(path, **options)
 
     def write(
         self,
@@ -117,11 +98,11 @@ class ScoresWriter(ResumableWriter):
         if not self._names and self.positions is None:
             raise DataError(f"{self.path}: not one sample was scored; nothing was written")
         file = self._file
-        file.create_dataset("name", data=np.array(self._names, dtype=object), dtype=STRING)
-        file.create_dataset("split", data=np.array(self._splits, dtype=object), dtype=STRING)
-        file.create_dataset("label", data=np.array(self._labels, _FIELD["label"].dtype), **_PACKED)
+        write_strings(file, "name", self._names)
+        write_strings(file, "split", self._splits)
+        file.create_dataset("label", data=np.array(self._labels, _FIELD["label"].dtype), **PACKED)
         if self.rejects:
-            file.create_dataset("rejected", data=np.array(self._rejected, _FIELD["rejected"].dtype), **_PACKED)
+            file.create_dataset("rejected", data=np.array(self._rejected, _FIELD["rejected"].dtype), **PACKED)
         for name, rows in zip(("scores", *(f"streams/{stream}" for stream in self.streams)), self._rows):
             table = np.frombuffer(rows, _FIELD["scores"].dtype) if rows else np.zeros(0, _FIELD["scores"].dtype)
             file.create_dataset(name, data=table.reshape(len(self._names), len(self.class_names)))
@@ -142,7 +123,7 @@ class ScoresReader:
             self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
             for key in ("scores", "label"):
                 if key not in file:
-                    raise DataError(f"{path}: data set {key!r} is missing; the file is incomplete, make it again")
+                    raise absent(path, key)
             self.scores, self.labels = file["scores"][:], file["label"][:]
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
             self.rejected = file["rejected"][:].astype(bool) if "rejected" in file else None

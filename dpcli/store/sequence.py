@@ -86,10 +86,6 @@ class CloudSequence:
         """Returns the points of frame t, f32 (N_t,3), a view."""
         return self.points[self.frame_offsets[t] : self.frame_offsets[t + 1]]
 
-    def original_frame(self, t: int) -> np.ndarray:
-        """Returns the points of frame t where the raw data have them, f64 (N_t,3): with the shift added."""
-        return self.frame(t).astype(np.float64) + (0.0 if self.shift is None else self.shift)
-
     def value(self, name: str) -> Any:
         """Returns a field by its name in the file, kept columns among them; None when the sample lacks it."""
         return self.extra.get(name) if name.startswith(KEPT) else getattr(self, name)
@@ -111,7 +107,7 @@ class CloudSequence:
         self.extra = {name: values.take(rows) for name, values in self.extra.items()}
 
     def pad_parts(self, parts: int) -> None:
-        """Lets `pose` and `joint` speak of so many parts: those that the sequence lacks rest, without a joint above them."""
+        """Extends `pose` and `joint` to so many parts; those that the sequence lacks stand still and have no joint."""
         if self.pose is not None:
             still = np.tile(np.eye(4), (self.num_frames, parts - self.pose.shape[1], 1, 1))
             self.pose = np.concatenate([self.pose, still], axis=1)
@@ -185,7 +181,7 @@ class CloudSequence:
         self.validate_values()
 
     def validate_values(self) -> None:
-        """Raises DataError where a field beside the points, of the right type and shape, holds what nobody can work with."""
+        """Raises DataError where a field beside the points, of the right type and shape, holds unusable values."""
         where = f"sample {self.name!r}"
         if self.scene_flow is not None and not are_lengths(self.scene_flow):
             raise DataError(f"{where}: scene_flow holds {NO_LENGTHS}; drop the points whose motion is unknown")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,13 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store.file import (
-    STRING,
     open_store,
     read_positions,
     read_provenance,
     read_skipped,
     read_strings,
     root_attributes,
+    write_strings,
 )
 from dpcli.store.writing.resumable_writer import ResumableWriter
 from dpcli.text_files import parse_json
@@ -31,30 +30,10 @@ class StatisticsWriter(ResumableWriter):
 
     kind = "statistics"
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        class_names: Sequence[str],
-        provenance: Sequence[dict],
-        length_unit: str = "",
-        seed: int = 0,
-        source: str = "",
-        force: bool = False,
-        resume: bool = False,
-    ) -> None:
+    def __init__(self, path: str | Path, **options: Any) -> None:
         self._names: list[str] = []
         self._texts: list[str] = []
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
+        super().__init__(path, **options)
 
     def write(self, name: str, values: dict[str, Any]) -> None:
         """Adds one sample: numbers, texts, lists and arrays by name; arrays come back as they were, to the bit."""
@@ -76,7 +55,7 @@ class StatisticsWriter(ResumableWriter):
 
     def _complete(self) -> None:
         for name, texts in (("name", self._names), ("statistics", self._texts)):
-            self._file.create_dataset(name, data=np.array(texts, dtype=object), dtype=STRING)
+            write_strings(self._file, name, texts)
 
 
 class StatisticsReader:

@@ -253,7 +253,7 @@ def _known(values: np.ndarray) -> np.ndarray:
 
 
 def _count(values: Iterable[Any]) -> dict[str, int]:
-    """Counts how often each value occurs, in the order of the values; keys as text, as JSON wants them."""
+    """Counts how often each value occurs, in the order of the values; keys as text, as JSON requires."""
     return {str(value): count for value, count in sorted(Counter(np.asarray(values).tolist()).items())}
 
 

@@ -12,13 +12,21 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.runtime.whole_file import refuse_existing
-from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import (
+    PACKED,
+    history_of,
+    open_store,
+    read_provenance,
+    read_strings,
+    root_attributes,
+    write_root,
+    write_strings,
+)
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
 
 ROLES = ("reference", "train", "test")
 _FIELD = fields_of("views")
-_PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _RIGID = 1e-5  # how far R R^T may be from the identity: room for matrices that were once float32
 
 
@@ -28,7 +36,7 @@ class ViewsHeader:
 
     name: str. intrinsics: f64 (V,3,3) pixels, pixel centers at +0.5. world_to_camera: f64 (V,4,4) rigid, OpenCV axes.
     time: f64 (T) seconds, rising. role: V of reference | train | test, with one reference. reference: its index.
-    size: (width, height) pixels. length_unit: of the world; "" = nobody knows.
+    size: (width, height) pixels. length_unit: of the world; "" = unknown.
     """
 
     name: str
@@ -133,7 +141,7 @@ class ViewsWriter:
         part = None if part is None else np.asarray(part, _FIELD["part"].dtype)
         _check_truth(header.name, header.num_frames, track, part)
         self.header = header
-        self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
+        self.provenance = history_of(provenance)
         self._written = np.zeros((header.num_views, header.num_frames), bool)
         self._atomic = AtomicFile(path)
         try:
@@ -157,10 +165,10 @@ class ViewsWriter:
         width, height = header.size
         picture = (height, width, 4)
         shape = (header.num_views, header.num_frames, *picture)
-        self._rgba = file.create_dataset("rgba", shape, _FIELD["rgba"].dtype, chunks=(1, 1, *picture), **_PACKED)
+        self._rgba = file.create_dataset("rgba", shape, _FIELD["rgba"].dtype, chunks=(1, 1, *picture), **PACKED)
         for key in ("intrinsics", "world_to_camera", "time"):
             file.create_dataset(key, data=np.asarray(getattr(header, key), _FIELD[key].dtype))
-        file.create_dataset("role", data=np.array(header.role, dtype=object), dtype=STRING)
+        write_strings(file, "role", header.role)
         if track is not None:
             file.create_dataset("track", data=track)
         if part is not None:
@@ -221,7 +229,7 @@ class ViewsReader:
     def _load_header(self, file: h5py.File) -> ViewsHeader:
         for key in ("rgba", "intrinsics", "world_to_camera", "time"):
             if key not in file or file[key].dtype.kind not in "fu":
-                raise DataError(f"{self.path}: data set {key!r} is missing or no numbers; make the file again")
+                raise DataError(f"{self.path}: data set {key!r} is missing or not numeric; make the file again")
         for key in ("name", "reference"):
             if key not in file.attrs:
                 raise DataError(f"{self.path}: attribute {key!r} is missing; the file is incomplete, make it again")

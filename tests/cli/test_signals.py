@@ -296,7 +296,7 @@ main()
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_as_a_worker_starts_ends_the_command(name, tmp_path):
-    """The pool didn't know of that worker, which took the word to end that another one waited for: for ever."""
+    """The pool didn't know of that worker, which took the word to end that another one waited for: forever."""
     words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o".split()
     done = subprocess.run(
         [sys.executable, "-c", AS_A_WORKER_STARTS.format(name=name), *words, tmp_path / "a.h5"],

@@ -218,7 +218,7 @@ def test_mixtures_are_refused_with_what_differs(folder, tmp_path, monkeypatch, c
         assert said in told and str(first) in told, told
     assert exit_code(*base, "-o", tmp_path / "whole.h5") == 0
     assert exit_code("prepare", "merge", first, tmp_path / "whole.h5", "-o", tmp_path / "all.h5") == 2
-    assert "is no shard" in capsys.readouterr().err and not (tmp_path / "all.h5").exists()
+    assert "is not a shard" in capsys.readouterr().err and not (tmp_path / "all.h5").exists()
     assert file_kind(first) == "scores"
 
 

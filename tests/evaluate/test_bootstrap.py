@@ -64,20 +64,6 @@ def test_coverage(method, draw):
     assert 0.93 <= covered / 400 <= 0.97
 
 
-def test_frames_of_one_sequence_stay_together():
-    """Values that are equal within a group: resampling them one by one claims far too much."""
-    rng = np.random.default_rng(0)
-    groups = np.repeat(np.arange(30), 10)
-    covered = np.zeros(2)
-    for number in range(200):
-        metric = mean_of(rng.normal(size=30)[groups])
-        for column, own in enumerate((None, groups)):
-            found = bootstrap(metric, 300, generator(2, number), resamples=300, method="percentile", groups=own)["mean"]
-            covered[column] += found.low <= 0 <= found.high
-    alone, together = covered / 200
-    assert together > 0.89 and alone < 0.6
-
-
 @pytest.mark.parametrize(("method", "scipys"), [("bca", "BCa"), ("percentile", "percentile")])
 @pytest.mark.parametrize("confidence", [0.95, 0.8])
 def test_equals_scipy_on_the_same_resamples(method, scipys, confidence):
@@ -107,14 +93,12 @@ def test_counts_are_draws_with_replacement_and_blocks_do_not_matter(monkeypatch)
     assert len(blocks) > 10 and np.array_equal(np.concatenate(blocks), whole)
 
 
-def test_leaving_out_by_blocks_and_by_groups(monkeypatch):
+def test_leaving_out_by_blocks(monkeypatch):
     values = np.array([1.0, 2, 4, 8, 16])
     expected = (values.sum() - values) / 4
     assert left_out_once(mean_of(values), 5)["mean"] == pytest.approx(expected)
     monkeypatch.setattr("dpcli.evaluate.bootstrap._BLOCK", 10)
     assert left_out_once(mean_of(values), 5)["mean"] == pytest.approx(expected)
-    grouped = left_out_once(mean_of(values), 5, np.array([0, 0, 1, 1, 1]))["mean"]
-    assert grouped == pytest.approx([28 / 3, 1.5])
     assert left_out_once(mean_of(np.zeros(2001)), 2001) is None
 
 
@@ -128,8 +112,6 @@ def test_degenerate_samples():
     equal = bootstrap(mean_of(np.full(9, 0.1)), 9, generator(0), resamples=200)["mean"]
     assert equal.low == equal.high == pytest.approx(0.1)
     assert not bootstrap(mean_of(np.ones(1)), 1, generator(0), resamples=200)["mean"].defined
-    one_group = bootstrap(mean_of(np.arange(4.0)), 4, generator(0), resamples=200, groups=np.zeros(4, int))
-    assert not one_group["mean"].defined
     assert Resampling(0).intervals(mean_of(np.ones(3)), 3) == {}
     undefined = bootstrap(mean_of(np.full(3, np.nan)), 3, generator(0), resamples=200)["mean"]
     assert not undefined.defined

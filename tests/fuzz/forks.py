@@ -30,13 +30,17 @@ class Limits:
 
 @dataclass(frozen=True)
 class Ended:
-    """What a run left: exit code (a signal's number negative), stderr, stdout, seconds, bytes of memory at its peak."""
+    """What a run left: exit code (a signal's number negative), stderr, stdout, seconds, bytes of memory at its peak.
+
+    quiet: seconds between its last word on stderr and its end.
+    """
 
     code: int
     said: str
     printed: str
     seconds: float
     memory: int
+    quiet: float = 0.0
 
 
 def forked(work: Callable[[], int], limits: Limits, folder: Path | None = None) -> Ended:
@@ -55,7 +59,8 @@ def forked(work: Callable[[], int], limits: Limits, folder: Path | None = None) 
         _, status, used = os.wait4(child, 0)
         code = -signal.SIGALRM if timed_out else os.waitstatus_to_exitcode(status)
         texts = [os.pread(one.fileno(), 1 << 20, 0).decode(errors="backslashreplace") for one in (said, printed)]
-    return Ended(code, *texts, time.monotonic() - began, used.ru_maxrss << 10)
+        quiet = time.time() - os.fstat(said.fileno()).st_mtime
+    return Ended(code, *texts, time.monotonic() - began, used.ru_maxrss << 10, quiet)
 
 
 def _waited(child: int, seconds: float) -> bool:

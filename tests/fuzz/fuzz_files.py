@@ -307,4 +307,4 @@ def main(words: Sequence[str] | None = None) -> int:
 if __name__ == "__main__":
     code = main()
     sys.stdout.flush()
-    os._exit(code)  # what was loaded for the forks has threads that Python would wait for, for ever
+    os._exit(code)  # what was loaded for the forks has threads that Python would wait for, forever

@@ -21,8 +21,11 @@ QUIET = Ended(0, "", "", 0.1, 100 << 20)
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks are watched as Linux does")
 
 
-def found(tmp_path, code=0, said="", printed="", memory=100 << 20):
-    return list(faults(Ended(code, said, printed, 0.1, memory), QUIET, tmp_path))
+BAR = "dpc: train dynamic 184/320 57% 6.5 clip/s epoch 23/40 loss 2.118 eta 20s\n"
+
+
+def found(tmp_path, code=0, said="", printed="", memory=100 << 20, quiet=0.0):
+    return list(faults(Ended(code, said, printed, 0.1, memory, quiet), QUIET, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -33,6 +36,9 @@ def found(tmp_path, code=0, said="", printed="", memory=100 << 20):
         ({"code": UNEXPECTED, "said": "Traceback (most recent call last)"}, ["traceback"]),
         ({"code": -signal.SIGSEGV}, ["signal SIGSEGV"]),
         ({"code": -signal.SIGXCPU}, ["hang"]),
+        ({"code": -signal.SIGXCPU, "said": BAR, "quiet": 4.0}, []),
+        ({"code": -signal.SIGXCPU, "said": BAR, "quiet": 19.0}, ["hang"]),
+        ({"code": -signal.SIGALRM, "said": f"{BAR}dpc: warning: x\n"}, ["hang"]),
         ({"code": 1, "said": "dpc: error: not enough memory on this machine"}, ["believed a size"]),
         ({"code": 3}, ["unexplained exit 3"]),
         ({"code": 3, "said": "dpc: error: \x1b[31mRED"}, ["unprintable"]),
@@ -75,6 +81,8 @@ def test_forks_are_ended_in_time():
     assert forked(lambda: time.sleep(60) or 0, Limits(seconds=0.3)).code == -signal.SIGALRM
     said = forked(lambda: print("hi") or 7, Limits())
     assert (said.code, said.printed, said.said) == (7, "hi\n", "")
+    ended = forked(lambda: print("x", file=sys.stderr) or time.sleep(0.6) or 0, Limits())
+    assert 0.5 < ended.quiet < 5
     assert forked(lambda: len(bytearray(2 << 30)), Limits(memory=1 << 30)).code == UNEXPECTED
 
 

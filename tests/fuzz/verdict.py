@@ -18,14 +18,15 @@ MORE_MEMORY = 200 << 20  # than the run on the undamaged input
 _LOSS = re.compile(
     r"(?<!\b0 )skipped|(?<!\b0 )dropped|left out|warning|instead of|lost|fewer|claims|says", re.IGNORECASE
 )
-_WORKS = re.compile(r"eta \d+h\d+m\s*$")  # a bar that moves, through the hours of work that a setting asks for
+_BAR = re.compile(r" eta [\dhms]+\s*$")
+_MOVING = 15  # seconds: a bar writes a line every 5, so one that wrote later than this before the end was still moving
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x9b\u202e]")
 
 
 def faults(ended: Ended, seed: Ended, folder: Path) -> Iterator[str]:
     """The names of what is wrong with a run in this folder; none where all is as promised."""
     if ended.code in (-signal.SIGALRM, -signal.SIGXCPU):
-        if not _WORKS.search(ended.said):
+        if not (_BAR.search(ended.said) and ended.quiet < _MOVING):  # else it does the work that a setting asks for
             yield "hang"
     elif ended.code < 0:
         yield f"signal {signal.Signals(-ended.code).name}"

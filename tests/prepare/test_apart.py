@@ -1,4 +1,4 @@
-"""Samples that take their process down, or loop in C for ever, cost themselves alone, also with one process."""
+"""Samples that take their process down, or loop in C forever, cost themselves alone, also with one process."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def test_several_arrays_in_one_file_are_not_one(tmp_path):
         for _ in range(3):
             np.save(file, np.ones((2, 4, 5), np.uint16))
     for read in (read_array, ArraySource):
-        with pytest.raises(DataError, match="a.npy: 416 bytes behind the array of shape .*save each array"):
+        with pytest.raises(DataError, match="a.npy: 416 bytes follow the array of shape .*save each array"):
             read(path)
 
 
@@ -216,7 +216,7 @@ def test_bytes_behind_the_triangles_of_an_stl_are_passed_over_and_told(behind, t
     whole = shape_of(path)
     path.write_bytes(data + behind)
     np.testing.assert_array_equal(shape_of(path), whole)
-    assert f"a.stl: {len(behind)} bytes behind its 80 triangles were passed over" in capfd.readouterr().err
+    assert f"a.stl: {len(behind)} bytes behind its 80 triangles were ignored" in capfd.readouterr().err
     path.write_bytes(data + data[-50:])
     with pytest.raises(DataError, match="damaged: its header counts 80 triangles, it holds 81"):
         shape_of(path)

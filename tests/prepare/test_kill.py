@@ -206,7 +206,7 @@ def test_a_journal_of_other_work_stays_and_force_starts_over(killed, tmp_path):
     left = {".a.h5.part": killed[0], ".a.h5.new": killed[2]}
     for name, content in left.items():
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(UsageError, match="kept for it is of other work .config .*, now 2.*--force"):
+    with pytest.raises(UsageError, match="stopped run with other settings or inputs .config .*, now 2.*--force"):
         CloudsWriter(tmp_path / "a.h5", **{**options(), "provenance": {"config": 2}})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
     with CloudsWriter(tmp_path / "a.h5", **{**options(), "force": True}) as writer:
@@ -226,7 +226,7 @@ def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path
         patch.setattr(item_pass, "ordered_map", dies_after_three)
         run(["toy", "RAW"])
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(UsageError, match="of other work .config.points 0, now 1; config.sampling"):
+    with pytest.raises(UsageError, match="with other settings or inputs .config.points 0, now 1; config.sampling"):
         run(["toy", "RAW", "--points", "1"], points=1)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
     read = []

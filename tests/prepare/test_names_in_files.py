@@ -280,7 +280,7 @@ def test_files_of_a_bag_are_in_its_folder(tmp_path):
     (tmp_path / "secret.db3").write_bytes(b"")
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 5\n")
     (bag / "a.db3").symlink_to(tmp_path / "secret.db3")
-    with pytest.raises(DataError, match="'a.db3' lies outside the folder"):
+    with pytest.raises(DataError, match="'a.db3' is outside the folder"):
         with open_recording(bag):
             pass
 

@@ -223,7 +223,7 @@ def test_a_whole_animal_passes(panda):
         (lambda raw: (raw / "sequences").write_text("walk 5\n"), "walk: 3 of the 5 frames are there"),
         (
             lambda raw: (raw / "sequences").write_text("walk 3\nrun 9\n"),
-            "img/run: missing; sequences tells of its 9 frames",
+            "img/run: missing; sequences gives it 9 frames",
         ),
         (lambda raw: shutil.rmtree(raw / "img"), "img/*/*/img_????_alpha.png: missing"),
     ],

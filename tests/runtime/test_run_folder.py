@@ -85,9 +85,9 @@ def test_a_command_that_fails_deletes_no_model(data, finished, tmp_path, dpc_her
     before = contents(finished)
     assert ".lock" not in before and "best.safetensors" in before
     for more, code, said in (
-        (("--init", finished), 2, f"--init {finished}/best.safetensors: lies in the folder of -o"),
+        (("--init", finished), 2, f"--init {finished}/best.safetensors: is in the folder of -o"),
         (("--set", f"static_from={finished / 'best.safetensors'}"), 2, "static_from = "),
-        (("--init", tmp_path / "link.safetensors"), 2, "lies in the folder of -o"),
+        (("--init", tmp_path / "link.safetensors"), 2, "is in the folder of -o"),
         (("--init", "nosuch"), 3, "--init nosuch: no such file"),
         (("--set", "static_from=nosuch"), 3, "static_from = nosuch: no such file"),
         (("--set", f"static_from={other}"), 3, "not a complete safetensors file"),

@@ -38,7 +38,7 @@ def test_a_machine_whose_processes_share_nothing_is_told_what_works(monkeypatch)
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(pool, "ProcessPoolExecutor", no_place)
-    with pytest.raises(DpcError, match=r"/dev/shm \(Read-only file system\); --jobs 1 needs none"):
+    with pytest.raises(DpcError, match=r"/dev/shm for them \(Read-only file system\); --jobs 1 needs none"):
         next(ordered_map(square, range(2), 2))
 
 

@@ -66,7 +66,7 @@ def test_a_pose_without_an_inverse_is_bad_data(tmp_path):
     sequence.pose[1] = 0
     with CloudsWriter(tmp_path / "d.h5", class_names=["drawer"], fields=["part", "pose"]) as writer:
         writer.write(sequence)
-    with CloudsReader(tmp_path / "d.h5") as reader, pytest.raises(DataError, match="d: a pose is no rigid motion"):
+    with CloudsReader(tmp_path / "d.h5") as reader, pytest.raises(DataError, match="d: a pose is not a rigid motion"):
         source = PairSource(reader, [0], 20, 0)
         source.load(source.pairs[0])
 

@@ -108,7 +108,7 @@ def test_part_of_another_configuration_stays_and_force_starts_over(tmp_path, thr
     with pytest.raises(Stopped), CloudsWriter(path, provenance={"config": 1}, resume=True) as writer:
         writer.write(three[0])
         raise Stopped("now")
-    with pytest.raises(UsageError, match="of other work .config 1, now 2"):
+    with pytest.raises(UsageError, match="with other settings or inputs .config 1, now 2"):
         CloudsWriter(path, provenance={"config": 2}, resume=True)
     assert (tmp_path / ".a.h5.part").exists() and (tmp_path / ".a.h5.new").exists()
     with CloudsWriter(path, provenance={"config": 2}, resume=True, force=True) as writer:

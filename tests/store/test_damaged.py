@@ -228,7 +228,7 @@ def test_no_attribute_of_any_kind_can_be_a_bug(kind, tmp_path):
 @pytest.mark.parametrize(
     "name, change, said",
     [
-        ("name", lambda v: np.array([b"s0"] * len(v)).astype(object), "'s0' is there twice"),
+        ("name", lambda v: np.array([b"s0"] * len(v)).astype(object), "'s0' occurs twice"),
         ("label", lambda v: v - 2, "label -2 of 's0', expected -1"),
         ("frame_offsets", lambda v: -v, "must start at 0 and never fall"),
     ],

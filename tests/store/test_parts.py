@@ -148,7 +148,7 @@ def test_a_part_with_another_number_of_parts_stays_and_force_starts_over(tmp_pat
         writer.write(*samples[0])
         raise Stopped("now")
     more = perfect(truth_sequence("s0"), K + 1)
-    with pytest.raises(UsageError, match=f"of other work .num_parts {K}, now {K + 1}"):
+    with pytest.raises(UsageError, match=f"with other settings or inputs .num_parts {K}, now {K + 1}"):
         PartsWriter(tmp_path / "a.h5", num_parts=K + 1, resume=True)
     with PartsWriter(tmp_path / "a.h5", num_parts=K + 1, resume=True, force=True) as writer:
         assert writer.written_names == []

@@ -13,6 +13,7 @@ from dpcli.classify.data.descriptors import descriptors
 from dpcli.errors import DataError
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import scikit_learn_state
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
 from dpcli.store.pipes import refuse_repeats
@@ -105,7 +106,7 @@ def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iter
     if fewest < 2:
         raise DataError(f"{reader.path}: a class of one video and no test split; expected at least two videos a class")
     if fewest < _STEADY:
-        log.warn(f"{reader.path}: a class of {fewest} videos; the accuracy says little")
+        log.warn(f"{reader.path}: a class has only {fewest} videos; the accuracy is unreliable")
     yield from StratifiedKFold(min(_FOLDS, fewest), shuffle=True, random_state=0).split(known, labels)
 
 
@@ -115,7 +116,7 @@ def _forest_scores(
     """Returns the probabilities that a forest gives; a class that it never saw has 0."""
     from sklearn.ensemble import RandomForestClassifier
 
-    forest = RandomForestClassifier(TREES, random_state=seed % 2**32, n_jobs=1).fit(learned, labels)
+    forest = RandomForestClassifier(TREES, random_state=scikit_learn_state(seed), n_jobs=1).fit(learned, labels)
     scores = np.zeros((len(judged), classes), np.float32)
     scores[:, forest.classes_] = forest.predict_proba(judged)
     return scores

@@ -28,6 +28,7 @@ from dpcli.runtime.progress import Progress
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.whole_file import PICTURES
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
+from dpcli.store.file import PACKED
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class _ActivationWriter(CloudsWriter):
 
     def _complete(self) -> None:
         for name, values in self.more.items():
-            self._file.create_dataset(name, data=values, compression="gzip", compression_opts=4, shuffle=True)
+            self._file.create_dataset(name, data=values, **PACKED)
         super()._complete()
 
 

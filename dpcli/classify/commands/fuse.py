@@ -85,7 +85,7 @@ def _judges(inputs: Sequence[str], output: str, weights: str | None, weights_fro
     if mean not in MEANS:
         raise UsageError(f"--mean {mean}: expected {' or '.join(MEANS)}")
     if weights is not None and weights_from is not None:
-        raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
+        raise UsageError("--weights gives the weights and --weights-from chooses them; give only one of the two")
     judges = weights_from.split(",") if weights_from is not None else []
     if weights_from is not None and len(judges) != len(inputs):
         raise UsageError(
@@ -122,8 +122,8 @@ def _streams(
             bad = np.flatnonzero((scores < 0).any(1) | (np.abs(scores.sum(1, dtype=np.float64) - 1) > _OFF))
             if len(bad):
                 raise DataError(
-                    f"{name}: {stream} of {reader.names[bad[0]]!r} are no probabilities ({len(bad)} such samples); "
-                    "expected numbers from 0 up whose sum is 1, as softmax makes of logits"
+                    f"{name}: {stream} of {reader.names[bad[0]]!r} are not probabilities ({len(bad)} such samples); "
+                    "expected numbers from 0 up whose sum is 1, as from a softmax"
                 )
     if len(readers) > 1:
         return stream_names(short_names(called)), list(readers), matching_rows(readers, called)

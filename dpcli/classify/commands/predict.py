@@ -171,6 +171,6 @@ def _score_videos(
 
 
 def _worthwhile_processes(source: ClipSource, work: ScoreVideo) -> int:
-    """Returns how many processes pay: one for each core where there is more to do than their start takes, else one."""
+    """Returns how many processes are worthwhile: one for each core where the work takes longer than starting them, else one."""
     clips = sum(len(source.video_clips(sequence, work.clips_per_video)) for sequence in source.sequences)
     return cpu_count() if work.device == "cpu" and clips > _WORTH_WORKERS else 1

@@ -171,7 +171,7 @@ def _follow(
             made = predictor.add(points)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
-    except BrokenPipeError:  # nobody reads the lines any more
+    except BrokenPipeError:  # nothing reads the lines any more
         raise
     except (DpcError, OSError, KeyboardInterrupt) as error:
         problem = error
@@ -216,18 +216,18 @@ class _IrregularFrames:
             if not self.gaps:
                 log.warn(
                     f"nothing came for {silent:.1f} s before frame {number}: the frames before and after it count as"
-                    " neighbors; told once"
+                    " neighbors; reported once"
                 )
             self.gaps += 1
         if self._few:
             return
         if len(points) == 0:
             if not self.empty:
-                log.warn(f"frame {number} has no points: they are taken to be at the origin; told once")
+                log.warn(f"frame {number} has no points: they are taken to be at the origin; reported once")
             self.empty += 1
         elif len(points) < _SPARSE:
             if not self.sparse:
-                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; told once")
+                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; reported once")
             self.sparse += 1
 
     def sum_up(self) -> None:

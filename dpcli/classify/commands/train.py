@@ -47,10 +47,8 @@ from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
-SETTINGS_FILE = "settings.toml"
 AUTO = "auto"  # the preset that the data choose
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
 
@@ -147,7 +145,7 @@ def _train(
         stop_requested() as stop,
     ):  # last: --force deletes an earlier model
         if processes.first:
-            write_whole(folder.file(SETTINGS_FILE), settings.to_toml(f"classify train --seed {seed}").encode())
+            folder.write_settings(settings.to_toml(f"classify train --seed {seed}"))
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
@@ -312,7 +310,7 @@ def _new_model(settings: TrainingSettings, videos: _Videos, folder: RunFolder) -
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
             log.warn(
                 f"{option} {name}: its static stream learned from neighbors up to {other.config.static_radius} frames away, here"
-                f" {config.static_radius}; --set static_temporal_radius={other.config.static_radius} goes on as it was"
+                f" {config.static_radius}; --set static_temporal_radius={other.config.static_radius} keeps that"
             )
     return model
 

@@ -22,13 +22,13 @@ class Augmentation:
     """
 
     scale: float = setting(0.2, "Factor of the size, from 1-s to 1+s.", least=0, below=1, name="augment_scale")
-    per_axis: bool = setting(True, "A factor of its own for each axis.", name="augment_per_axis")
+    per_axis: bool = setting(True, "Scale each axis by a factor of its own.", name="augment_per_axis")
     turn: float = setting(
-        0.4, "Largest turn about the camera's vertical axis y, in radians.", least=0, name="augment_turn"
+        0.4, "Largest rotation about the camera's vertical axis y, in radians.", least=0, name="augment_turn"
     )
     tilt: float = setting(
         0.1,
-        "Standard deviation of small turns about all axes, in radians, at most 3 of them.",
+        "Standard deviation of small rotations about all axes, in radians; at most 3 deviations.",
         least=0,
         name="augment_tilt",
     )
@@ -55,7 +55,7 @@ class Augmentation:
     )
     origin: bool = setting(
         False,
-        "Scale and turn about the camera, so that a far body moves by meters; false: about the clip's mean.",
+        "Scale and rotate about the camera, so that a distant body moves by meters; false: about the clip's mean.",
         name="augment_origin",
     )
     warp: float = setting(

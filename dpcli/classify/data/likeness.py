@@ -61,7 +61,7 @@ def tell_rounded(what: str, found: dict[str, float]) -> None:
     if found.get("step", 0) > _ROUNDED * found.get("extent", np.inf):
         log.warn(
             f"{what}: coordinates are so large, as on a map, that float32 rounds them to {found['step']:.2g}, while half of the"
-            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a place nearby before the file is"
+            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a nearby position before the file is"
             " written, as `dpc prepare clouds` does"
         )
 
@@ -90,7 +90,7 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
     if size and far is not None and in_units and not size / _OTHER_UNIT < far < size * _OTHER_UNIT:
         log.warn(
             f"{what}: half of the points lie within {far:.3g} of the middle, within {size:.3g} in what {model} learned from:"
-            " another unit of length? The scores mean nothing then; `dpc prepare clouds --scale` brings both to the same"
+            " is the unit of length another one? The scores would be meaningless; `dpc prepare clouds --scale` converts one to the other"
         )
     if far is None:
         return

@@ -18,7 +18,7 @@ from dpcli.runtime.progress import log
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.schema import kept_name
 
-FARTHEST = 3.0  # units from the median: beyond it lies nobody who makes a gesture
+FARTHEST = 3.0  # units from the median: no gesture reaches farther
 _EXTREME = 3.0  # spreads: a column's value beyond counts as being there
 _FAST, _SLOWEST = 0.8, 0.1  # the quantile that is a video's level, which is about 1 spread; the least level
 _LEAST = 4  # points that random changes leave of a video

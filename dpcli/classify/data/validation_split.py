@@ -161,7 +161,7 @@ def about_classes(reader: CloudsReader, judges: dict[int, int]) -> str:
 
 
 def about_people(reader: CloudsReader, training: list[int], validation: list[int]) -> str:
-    """Returns what a person must know before believing the accuracy of validation, "" where nobody seen there trained."""
+    """Returns a caveat about the validation accuracy for the user, "" where no person is in both training and validation."""
     learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))
     if not judged:
         return ""

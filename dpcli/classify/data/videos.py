@@ -17,7 +17,7 @@ from dpcli.store import CloudsReader
 
 def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name: str) -> list[int]:
     """Returns the sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is
-    `held_out` where no sample bears that name. Raises DataError when there are none."""
+    `held_out` where no sample has that name. Raises DataError when there are none."""
     wanted = split
     if split == "validation" and split not in reader.splits:
         return held_out(reader, info, model_name)

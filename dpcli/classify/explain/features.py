@@ -65,7 +65,7 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     else:
         if chosen < count - 1 and sizes[chosen] in sizes[chosen + 1 :]:
             raise UsageError(
-                f"stage = {chosen + 1}: later stages have as many centroids; only stage = {count} can be told"
+                f"stage = {chosen + 1}: later stages have as many centroids; only stage = {count} can be explained"
             )
         values, gradient = _seen(_last_call(getattr(model, stream), run, sizes[chosen]), run, target)
     shape = (sizes[chosen], -1)

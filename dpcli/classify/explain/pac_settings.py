@@ -15,7 +15,7 @@ class PacSettings:
     """Holds what is asked of each clip and how pictures show it. Raises UsageError for a class that no rule asks for."""
 
     rule: Literal["activation", "gradient"] = setting(
-        "activation", "activation (A.1.4: the largest activation, whatever the class) or gradient (Grad-CAM)."
+        "activation", "activation (A.1.4: the largest activation, independent of the class) or gradient (Grad-CAM)."
     )
     target: str | None = setting(
         None, "With rule = gradient: a class's name or number, predicted (also for none), or label.", name="class"
@@ -31,7 +31,9 @@ class PacSettings:
     def __post_init__(self) -> None:
         check(self)
         if self.target is not None and self.rule == "activation":
-            raise UsageError("class: the rule activation (thesis A.1.4) knows no class; add --set rule=gradient")
+            raise UsageError(
+                "class: the rule activation (thesis A.1.4) doesn't depend on a class; add --set rule=gradient"
+            )
 
 
 PAC = Catalog(pac=PacSettings)

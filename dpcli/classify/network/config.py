@@ -33,22 +33,22 @@ class KinetConfig:
     )
     variant: Literal["thesis", "release"] = setting(
         "thesis",
-        "Whose choices hold where the thesis and its published code disagree: changes group_size, xyz_group, time_input,"
+        "Whether the thesis's text or its published code decides where they disagree: changes group_size, xyz_group, time_input,"
         " weighting, merge, guard, fusion and grouping together.",
     )
     backbone: str = setting(
         "pointnet2",
         "Static network: pointnet2, dgcnn, spidercnn, slots (for sparse clouds, without a dynamic stream), or your own as"
-        " module:Class (docs/backbones.md). Another than the preset's brings sizes of its own.",
+        " module:Class (docs/backbones.md). A backbone other than the preset's changes the sizes, too.",
     )
     centroids: tuple[int, int] = setting(
         (1024, 512),
-        "Neighborhoods of a clip in the two stages of pointnet2. No weight depends on it: train with few, then go on by --init"
-        " with the preset's.",
+        "Neighborhoods of a clip in the two stages of pointnet2. No weight depends on their number: train with few first, then"
+        " with the preset's by --init.",
         least=1,
     )
     neighbors: int = setting(
-        64, "Points of a neighborhood. No weight depends on it, except with the backbone spidercnn.", least=1
+        64, "Points of a neighborhood. No weight depends on their number, except with the backbone spidercnn.", least=1
     )
     radii: tuple[float, float] = setting(
         (0.5, 1.0),
@@ -96,7 +96,7 @@ class KinetConfig:
         " by interpolation, as in the published code (cross).",
     )
     merge_norm: bool = setting(
-        False, "Batch norm in the residual merge; not in the thesis, trains in a fraction of the epochs."
+        False, "Batch norm in the residual merge: not in the thesis, but it trains in a fraction of the epochs."
     )
     solver: Literal["inverse", "ridge"] = setting(
         "inverse",
@@ -114,7 +114,7 @@ class KinetConfig:
     members: int = setting(1, "Networks whose scores are averaged (backbone slots).", least=1, most=64)
     copies: bool = setting(
         False,
-        "Learn also from mirrored and time-reversed copies of a clip, each kind of them with a classifier of its own, and average"
+        "Train also on mirrored and time-reversed copies of a clip, each kind with a classifier of its own, and average"
         " their scores (backbone slots).",
     )
     slot_details: bool = setting(

@@ -97,7 +97,7 @@ class KinematicUnit(nn.Module):
         """Returns the surfaces through the neighbors.
 
         activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous: deviations of the unit before;
-        last: no unit follows that wants deviations.
+        last: no unit follows that uses deviations.
         """
         config = self.config
         values = torch.cat([activation, times[..., None]], -1) if config.time_input else activation

@@ -69,7 +69,7 @@ def _blocks(reader: CloudsReader, sequence: int, columns: tuple[str, ...]) -> It
 def cut(found: WindowScores, class_names: Sequence[str], how: Cutting) -> list[Segment]:
     """Returns the segments of a recording in order, without gaps; the class "" is nothing.
 
-    A window speaks for the `hop` frames around its middle, the first and last ones also for the ends. The windows that see
+    A window is evidence for the `hop` frames around its middle, the first and last ones also for the ends. The windows that see
     a frame are window / hop, so each counts hop / window: the sum is the evidence of windows that don't overlap. Nothing
     competes as a class whose probability is always the threshold.
     """

@@ -62,7 +62,7 @@ def _file_frames(path: Path, follow: float, columns: tuple[str, ...]) -> Iterato
 
 
 class _Bytes:
-    """Reads a descriptor with the `read(count)` that numpy's header parser wants. Unbuffered: a buffer's lock would be held while
+    """Reads a descriptor with the `read(count)` that numpy's header parser needs. Unbuffered: a buffer's lock would be held while
     waiting, and the interpreter can't end while another thread holds stdin's."""
 
     def __init__(self, descriptor: int, follow: float) -> None:

@@ -78,8 +78,8 @@ def window_size(info: ModelInfo, window: int | None) -> int:
         return needed
     if window is None:
         raise UsageError(
-            f"this model looks at a whole video in {needed} parts, and a stream has no whole: name the frames to look back at,"
-            " about as many as an action lasts (--window 40, say)"
+            f"this model looks at whole videos in {needed} parts, and a stream has no end: give the number of frames to look back,"
+            " about as many as an action lasts, such as --window 40"
         )
     least = 1 if info.timing == "slots" else needed
     if window < least:

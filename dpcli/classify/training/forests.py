@@ -12,6 +12,7 @@ from dpcli.classify.network.descriptors import clip_descriptors
 from dpcli.classify.network.forest import Forest
 from dpcli.classify.network.kinet import Kinet
 from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import scikit_learn_state
 
 TREES = 125  # of each forest
 UNJUDGED = 0.3  # their share where no video is left to choose it by
@@ -34,7 +35,7 @@ def grow_forests(model: Kinet, source: ClipSource, seed: int) -> KinetConfig:
         own = folds != number
         if not own.any():
             own[:] = True
-        forest = ExtraTreesClassifier(TREES, random_state=(seed + number) % 2**32, n_jobs=1)
+        forest = ExtraTreesClassifier(TREES, random_state=scikit_learn_state(seed + number), n_jobs=1)
         grown.append(forest.fit(described[own], labels[own]))
     nodes = max(one.tree_.node_count for forest in grown for one in forest.estimators_)
     config = model.config.changed(forest=(TREES, nodes))
@@ -42,7 +43,7 @@ def grow_forests(model: Kinet, source: ClipSource, seed: int) -> KinetConfig:
         member.forest = Forest.grown(forest, nodes, config.num_classes).to(member.position.device)
     model.config = model.static.config = config
     model.static.forest_share.fill_(_share(model, clips, labels) if source.folds else UNJUDGED)
-    log.info(f"forests on descriptors have a share of {float(model.static.forest_share):.2f} beside the networks")
+    log.info(f"forests on descriptors have a weight of {float(model.static.forest_share):.2f} beside the networks")
     return config
 
 

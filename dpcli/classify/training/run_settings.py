@@ -26,14 +26,14 @@ class RunSettings:
     )
     validation: str = setting(
         "auto",
-        "Videos that validate: split (the file's own validation videos); or carved from the training videos by subject,"
-        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none; or cross (preset"
-        " sparse: all videos train, and members that never saw them judge). auto: split where the file has one, else cross or"
-        " subject, or 0.15 without subjects.",
+        "Validation videos: split (the file's own); or taken from the training videos by subject, subjects:3,5, fold:3/10"
+        " (counted from 0) or a fraction such as 0.15; or none; or cross (preset sparse: all videos are for training, and are"
+        " judged by members that never saw them). auto: split where the file has one, else cross or subject, or 0.15 without"
+        " subjects.",
     )
     augment: Literal["ours", "sparse", "peers", "release", "none"] = setting(
         "ours",
-        "Random changes of training clips, which the augment_... settings then change one by one: ours; sparse; peers (axis scales from"
+        "Random changes of training clips, which augment_... settings adjust one by one: ours; sparse; peers (axis scales from"
         " the camera, as other methods have on MSR-Action3D); release (the published code's); or none.",
     )
     pretrain: bool = setting(
@@ -42,11 +42,11 @@ class RunSettings:
     )
     init: str | None = setting(
         None,
-        "A trained or shipped model whose both streams to start from, such as one of other frames, or of other classes (its"
-        " last layers are fresh then).",
+        "A trained or shipped model, with whose two streams training starts; it may have other frames, or other classes (its"
+        " last layers are then new).",
     )
     static_from: str | None = setting(
-        None, "A trained model whose static stream to start from (rows ii and iv of table 3.1)."
+        None, "A trained model, with whose static stream training starts (rows ii and iv of table 3.1)."
     )
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ class Schedule:
 
     epochs: int = setting(150, "Epochs of the static stage.", least=0)
     epochs_dynamic: int = setting(
-        150, "Epochs of the dynamic stage, which learns on the frozen static stream.", least=0
+        150, "Epochs of the dynamic stage, which is trained on the frozen static stream.", least=0
     )
     batch: int = setting(16, "Clips per step, of all processes together.", least=1)
     learning_rate: float = setting(1e-3, "Adam's learning rate at its highest.", above=0, name="lr")
@@ -30,14 +30,14 @@ class Schedule:
         "Course of the learning rate: cosine (to 0, after a short warm-up), staircase (times 0.7 every 200,000 clips, as the"
         " published code does), or constant.",
     )
-    weight_decay: float = setting(0.0, "Weight decay of AdamW, of matrices alone.", least=0)
+    weight_decay: float = setting(0.0, "Weight decay of AdamW, for matrices only.", least=0)
     label_smoothing: float = setting(
-        0.0, "Share of each label spread over all classes: streams become less sure of themselves.", least=0, below=1
+        0.0, "Share of each label spread over all classes: streams become less confident.", least=0, below=1
     )
     fine_tune: Literal["all", "head", "probe", "auto"] = setting(
         "all",
-        "What of a model given by --init goes on learning: all of it, the head of each stream, or its last layer (probe); auto:"
-        " by the number of videos a class. The preset auto takes auto, and the model's own network, with --init.",
+        "Layers of a model given by --init that are trained: all, the head of each stream, or its last layer (probe); auto: by"
+        " the number of videos per class. With --init the preset auto takes auto and the model's own network.",
     )
     clips_per_video: int = setting(1, "Random clips per video and epoch; 0 takes every start.", least=0)
     validate_every: int = setting(1, "Epochs from one validation to the next.", least=1)
@@ -48,15 +48,15 @@ class Schedule:
         least=1,
     )
     amp: bool | None = setting(
-        None, "Matrix products in bfloat16; none: on GPUs that have it (Ampere and later), else not."
+        None, "Matrix products in bfloat16; none: on GPUs that support it (Ampere and later) only."
     )
     workers: int | None = setting(
         None, "Processes that load clips; none: 0 on a CPU, with a GPU 4 or as many as there are CPUs.", least=0
     )
     draws: int = setting(
         0,
-        "Fixed draws of every clip (start, points, augmentation) that the dynamic stage shows in turn, their neighbors searched"
-        " once and kept in a nameless file of the folder (preset thesis: 0.44 MB a clip and draw, quick 0.03); 0: a new draw"
+        "Fixed draws of every clip (start, points, augmentation) that the dynamic stage uses in turn; their neighbors are searched"
+        " once and kept in an unnamed file in the folder (preset thesis: 0.44 MB per clip and draw, quick 0.03); 0: a new draw in"
         " every epoch.",
         least=0,
     )

@@ -137,7 +137,7 @@ class Trainer:
                 raise
             self._save_state(together=False)
             raise DpcError(
-                f"a process that loads clips was killed, perhaps for want of memory ({str(error).splitlines()[0]});"
+                f"a process that loads clips was killed, perhaps for lack of memory ({str(error).splitlines()[0]});"
                 f" saved at epoch {self.epoch + 1}, step {self.step}: run again to continue, with fewer workers"
                 " (--set workers=0)"
             ) from None

@@ -20,7 +20,7 @@ def baseline(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Train and score a random forest in seconds, for a network to beat; it sees quantiles of position, motion, kept columns."""
+    """Train and score a random forest in seconds, as a baseline for networks; it sees quantiles of position, motion and kept columns."""
     from dpcli.classify.commands.baseline import baseline as run
 
     result = run(data, output=output, seed=seed, force=force)

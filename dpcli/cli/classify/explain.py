@@ -65,7 +65,10 @@ def tsne(
     stream: Stream = None,
     split: Split = "auto",
     perplexity: Annotated[
-        float | None, typer.Option(help="Neighbors that t-SNE keeps near. Default: 30, at most a third of the videos.")
+        float | None,
+        typer.Option(
+            help="Perplexity of t-SNE: about how many neighbors stay near. Default: 30, at most a third of the videos."
+        ),
     ] = None,
     clips_per_video: Annotated[int, typer.Option(min=0, help="Clips averaged for a video; 0 takes every start.")] = 4,
     batch: Annotated[int, typer.Option(help="Clips at a time.")] = 8,

@@ -13,7 +13,7 @@ def fuse(
     scores: Annotated[
         list[str],
         typer.Argument(
-            help="Scores files of the same videos, or one, whose streams are averaged anew; one may be - for a pipe."
+            help="Scores files of the same videos, or one file whose streams are averaged anew; one may be - for a pipe."
         ),
     ],
     output: Output,
@@ -21,15 +21,15 @@ def fuse(
         str | None,
         typer.Option(
             "--weights",
-            help="One per file, with commas, as 0.7,0.3; or by name, as static=0.3,dynamic=0.7. Default: all alike.",
+            help="One per file, with commas, as 0.7,0.3; or by name, as static=0.3,dynamic=0.7. Default: equal weights.",
         ),
     ] = None,
     weights_from: Annotated[
         str | None,
         typer.Option(
             "--weights-from",
-            help="Scores of other, labeled videos by the same models, as many files as are fused, with "
-            "commas between: the weights that suit them best (greatest likelihood).",
+            help="Scores of other, labeled videos by the same models, one for each fused file, with "
+            "commas between: the weights with the greatest likelihood on them.",
         ),
     ] = None,
     mean: Annotated[
@@ -37,7 +37,7 @@ def fuse(
     ] = "arithmetic",
     force: Force = False,
 ) -> None:
-    """Average the scores of several models, such as one on points and one on flow; each stays as a stream of its own."""
+    """Average the scores of several models, such as one on points and one on flow; each is kept as a stream."""
     from dpcli.classify.commands.fuse import fuse as run
 
     result = run(scores, output, weights=weights, weights_from=weights_from, mean=mean, force=force)

@@ -28,7 +28,7 @@ RejectBelow = Annotated[
     str | None,
     typer.Option(
         "--reject-below",
-        help="Confidence below which nothing is recognized: a number, or auto, the model's own. Default: auto with --stream and"
-        " --segments where the model has one; else none is rejected.",
+        help="Confidence below which nothing counts as recognized: a number, or auto, the model's own. Default: auto with --stream and"
+        " --segments where the model has one; otherwise nothing is rejected.",
     ),
 ]

@@ -56,7 +56,7 @@ Page = Annotated[
     typer.Option(
         "--page",
         rich_help_panel=PANEL,
-        help="With --stream: write a page of what was seen and said to this .html at the end.",
+        help="With --stream: write a page of the frames and predictions to this .html at the end.",
     ),
 ]
 JsonLines = Annotated[

@@ -17,7 +17,7 @@ from dpcli.runtime.settings.catalog import Given
 def profile(
     given: Given,
     model: Annotated[
-        str | None, typer.Option("--model", help="A trained model; else an untrained one of --preset.")
+        str | None, typer.Option("--model", help="A trained model. Default: an untrained one of --preset.")
     ] = None,
     classes: Annotated[int, typer.Option("--classes", help="Number of classes.")] = 20,
     steps: Annotated[
@@ -26,7 +26,7 @@ def profile(
     device: Device = "auto",
     json_output: Json = False,
 ) -> None:
-    """Show parameters and operations (true counts, the papers' beside), latency and peak memory."""
+    """Show parameters and operations (true counts, and by the papers' way of counting), latency and peak memory."""
     from dpcli.classify.commands.profile import profile as run
     from dpcli.classify.network_cost import render
 

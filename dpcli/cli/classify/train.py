@@ -29,7 +29,7 @@ def train(
 
     Presets: thesis and release (its text and its published code), quick (a seventh of the operations, fits a CPU), tiny
     (demo), sparse (at most 64 points a frame, as of a radar); auto takes sparse for such data, else quick. The folder's
-    settings.toml holds all settings; --config reads it back to an equal run.
+    settings.toml holds all settings; --config reads it back for an equal run.
 
     Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
     """
@@ -41,7 +41,7 @@ def train(
     typer.echo(result.weights)
     if not result.accuracy:
         typer.echo(
-            "no video was held out to judge it: `dpc classify predict` and `dpc evaluate classification` on others do"
+            "no video was held out to judge it: use `dpc classify predict` and `dpc evaluate classification` on other videos"
         )
     else:
         scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in result.accuracy.items())

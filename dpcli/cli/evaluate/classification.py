@@ -18,7 +18,7 @@ def classification(
     *,
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="Clouds file whose labels count. Default: the labels in the scores file."),
+        typer.Option("--truth", help="Clouds file with the true labels. Default: the labels in the scores file."),
     ] = None,
     split: Split = None,
     intersect: Intersect = False,

@@ -30,7 +30,7 @@ class ComparisonOptions:
         typer.Option(
             "--metrics",
             metavar="NAME,...",
-            help="Metrics to compare, such as accuracy or miou,ap,epe3d. Default: all that the files have.",
+            help="Metrics to compare, such as accuracy or miou,ap,epe3d. Default: all that the files allow.",
         ),
     ] = None
     protocol: Annotated[

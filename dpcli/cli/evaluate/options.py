@@ -109,7 +109,9 @@ class KeepOptions:
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help="Keep each sequence's counts in this file: a stopped run goes on, shards are merged."
+            "-o",
+            "--output",
+            help="Keep each sequence's statistics in this file, so that a stopped run continues and shards can be merged.",
         ),
     ] = None
     force: Force = False

@@ -42,7 +42,7 @@ class ProtocolOptions:
         str | None, word_option("--fvd", FVD_VARIANTS, "Published variant of FVD. Default: the protocol's.")
     ] = None
     every: Annotated[
-        int, typer.Option("--every", min=1, help="Start a window of FVD and FID-VID at each so many frames.")
+        int, typer.Option("--every", min=1, help="Frames between the starts of two windows of FVD and FID-VID.")
     ] = 1
 
 

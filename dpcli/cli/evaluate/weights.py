@@ -19,14 +19,14 @@ Names = Annotated[list[str] | None, typer.Argument(help="Names from `dpc evaluat
 
 
 def list_command(weights: Folder = None, as_object: Json = False) -> None:
-    """List the weights: what they are for, under what license, and which are here (judged by their size)."""
+    """List the weights: what they are for, their license, and which are installed (judged by their size)."""
     from dpcli.evaluate.commands.weights import list_weights
 
     print_result(list_weights(weights), FormOptions(as_object=as_object))
 
 
 def check_command(names: Names = None, weights: Folder = None, as_object: Json = False) -> None:
-    """Compute the digests of the weights that are here; exit 3 if one is damaged, or is named and absent."""
+    """Compute the digests of the installed weights; exit 3 if one is damaged, or is named and absent."""
     from dpcli.evaluate.commands.weights import check_named_weights
 
     print_result(check_named_weights(names or [], weights), FormOptions(as_object=as_object))
@@ -37,7 +37,7 @@ def fetch_command(
     everything: Annotated[bool, typer.Option("--all", help="Fetch all of them, 2.4 GB.")] = False,
     weights: Folder = None,
 ) -> None:
-    """Download weights, check them, and put them where the metrics find them; the paths go to stdout."""
+    """Download weights, check them, and put them where the metrics find them; print their paths to stdout."""
     from dpcli.evaluate.commands.weights import choose_weights, fetch_chosen_weights
     from dpcli.evaluate.networks.weights import weights_folder
     from dpcli.runtime.progress import log

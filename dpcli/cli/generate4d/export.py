@@ -13,7 +13,7 @@ from dpcli.generate4d.out.formats import Axes, Format
 def export(
     scene: Scene,
     output: Annotated[
-        str, typer.Option("-o", "--output", help="A file, a folder for one file a frame, or - (clouds).")
+        str, typer.Option("-o", "--output", help="A file, a folder for one file per frame, or - (clouds).")
     ],
     form: Annotated[
         Format,
@@ -24,7 +24,8 @@ def export(
         ),
     ] = "ply",
     time: Annotated[
-        float | None, typer.Option("--time", help="Write this second, not the canonical Gaussians, into one file.")
+        float | None,
+        typer.Option("--time", help="Write the Gaussians at this second into one file, instead of the canonical ones."),
     ] = None,
     axes: Annotated[
         Axes,

@@ -25,7 +25,10 @@ def train_prior(
     ] = None,
     seed: Seed = 0,
     jobs: Annotated[
-        int, typer.Option("--jobs", min=1, max=1024, help="Processes that make pictures; 1: between the steps.")
+        int,
+        typer.Option(
+            "--jobs", min=1, max=1024, help="Processes that make pictures; 1: made in this process, between the steps."
+        ),
     ] = 2,
     device: Device = "auto",
     force: Force = False,

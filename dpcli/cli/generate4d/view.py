@@ -14,15 +14,18 @@ def view(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page (.html).")],
     clip: Annotated[
-        Path | None, typer.Option("--input", help="The clip that was fitted (.h5): its pictures are shown beside.")
+        Path | None,
+        typer.Option("--input", help="The clip that was fitted (.h5), whose pictures are shown beside the scene."),
     ] = None,
-    title: Annotated[str | None, typer.Option("--title", help="Heading. Default: what was fitted.")] = None,
+    title: Annotated[str | None, typer.Option("--title", help="Heading. Default: the name of what was fitted.")] = None,
     min_opacity: Annotated[
         float, typer.Option("--min-opacity", min=0, max=1, show_default="1/255", help="Leave fainter Gaussians out.")
     ] = 1 / 255,
     fps: Annotated[
         float | None,
-        typer.Option("--fps", min=1, max=120, help="Frames of the clip per second. Default: its own, within 1 to 60."),
+        typer.Option(
+            "--fps", min=1, max=120, help="Frames of the clip per second. Default: its own rate, within 1 to 60."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:

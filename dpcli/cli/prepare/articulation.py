@@ -42,11 +42,10 @@ class ArticulationOptions:
     ] = "random"
     rotation: Annotated[
         float,
-        typer.Option("--rotation", min=0.0, max=180.0, help="Each frame is turned besides by up to this, degrees."),
+        typer.Option("--rotation", min=0.0, max=180.0, help="Additional rotation of each frame, up to this, degrees."),
     ] = 15.0
     translation: Annotated[
-        float,
-        typer.Option("--translation", min=0.0, help="Each frame is shifted by up to this, per axis, in diameters."),
+        float, typer.Option("--translation", min=0.0, help="Shift of each frame, up to this per axis, in diameters.")
     ] = 0.05
     joint_step: Annotated[
         float,
@@ -56,13 +55,20 @@ class ArticulationOptions:
         ),
     ] = 0.3
     max_parts: Annotated[
-        int, typer.Option("--max-parts", min=2, help="Parts of an object at most; joints drawn at random stay still.")
+        int,
+        typer.Option(
+            "--max-parts", min=2, help="Parts of an object at most; to keep to it, randomly chosen joints stay still."
+        ),
     ] = 8
     min_part: Annotated[
-        int, typer.Option("--min-part", min=0, help="Points that even a small part gets; tiny ones are glued on.")
+        int,
+        typer.Option("--min-part", min=0, help="Points that even a small part gets; tiny parts are joined to others."),
     ] = 8
     min_motion: Annotated[
-        float, typer.Option("--min-motion", min=0.0, help="Joints that move nothing by this, in diameters, stay still.")
+        float,
+        typer.Option(
+            "--min-motion", min=0.0, help="Joints that move no point by at least this, in diameters, stay still."
+        ),
     ] = 0.02
     visible_only: Annotated[
         bool, typer.Option("--visible-only", help="Joints that change no shape (a spinning wheel) stay still, too.")

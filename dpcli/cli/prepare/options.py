@@ -28,11 +28,11 @@ ItemSeconds = Annotated[
         "--item-seconds",
         min=0,
         rich_help_panel=RUNNING,
-        help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is passed over."
+        help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is skipped."
         " 0: no limit.",
     ),
 ]
-Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")]
+Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every nth frame.")]
 Pattern = Annotated[
     str,
     typer.Option(
@@ -92,7 +92,7 @@ SceneCoordinates = Annotated[
     typer.Option("--coordinates", help="published: x left, y up, z forward. camera: x right, y down, z forward."),
 ]
 Far = Annotated[float, typer.Option("--far", help="Drop what is farther from the camera, meters.")]
-Near = Annotated[float, typer.Option("--near", help="Drop what is not this far ahead of the scanner, meters.")]
+Near = Annotated[float, typer.Option("--near", help="Drop what is less than this far ahead of the scanner, meters.")]
 PictureSize = Annotated[int, typer.Option("--size", min=16, max=4096, help="Side of the square pictures, pixels.")]
 FramesAtMost = Annotated[
     int, typer.Option("--frames", min=0, help="At most this many frames, evenly sampled; 0 keeps all.")

@@ -40,7 +40,7 @@ def estimate_flow(
     spread: SpreadOptions,
     force: Force = False,
 ) -> None:
-    """Write the scene flow of every frame to the next (of the last frame back) as the field scene_flow of a clouds file."""
+    """Write the scene flow of every frame to the next (in the last frame, to the one before) as the field scene_flow of a clouds file."""
     from dpcli.segment.commands.estimate_flow import estimate_flow_of_file
 
     done = estimate_flow_of_file(

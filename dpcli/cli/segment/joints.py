@@ -21,7 +21,7 @@ def joints(
             "`dpc evaluate joints`; - for a pipe), or a folder for a URDF of each sequence.",
         ),
     ],
-    sequence: Annotated[str | None, typer.Option("--sequence", help="Take this sequence only. Default: all.")] = None,
+    sequence: Annotated[str | None, typer.Option("--sequence", help="Use this sequence only. Default: all.")] = None,
     picture: Picture = None,
     force: Force = False,
 ) -> None:

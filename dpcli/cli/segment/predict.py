@@ -53,7 +53,7 @@ def predict(
     spread: SpreadOptions,
     force: Force = False,
 ) -> None:
-    """Find the parts of every point, the same through all frames, each part's rigid motion, and the flow between frames."""
+    """Find the part of every point, consistent over all frames, each part's rigid motion, and the flow between frames."""
     settings = PredictSettings(
         **CATALOG.resolve(PredictSettings()._asdict(), _choose_method(given, model, fast, scene))
     )

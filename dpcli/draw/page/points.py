@@ -62,13 +62,6 @@ class PageFacts:
         }
 
 
-def spread(count: int, most: int) -> np.ndarray:
-    """Returns at most `most` of the numbers 0..count-1, evenly spread, i64; all of them where they are few enough."""
-    if count <= most:
-        return np.arange(count)
-    return np.linspace(0, count - 1, most).round().astype(np.int64)
-
-
 def frame_budget(sequences: int) -> int:
     """Returns how many frames of each of so many sequences a page shows."""
     return int(np.clip(MOST_FRAMES // max(sequences, 1), _FEWEST_FRAMES, _MOST_IN_SEQUENCE))

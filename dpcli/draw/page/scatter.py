@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dpcli.draw.page.assemble import data_page
-from dpcli.draw.page.points import PageFacts, spread
+from dpcli.draw.page.points import PageFacts
 from dpcli.draw.palette import part_colors
+from dpcli.draw.sheet import spread_evenly
 
 MOST_DOTS = 20_000
 
@@ -21,7 +22,7 @@ def scatter_page(
     planes: Mapping[str, tuple[np.ndarray, Mapping[str, float]]],
 ) -> str:
     """Returns the page. labels: i (S), -1 = unknown. planes: by stream, places f (S,2) without unit, and figures by name."""
-    kept = spread(len(names), MOST_DOTS)
+    kept = spread_evenly(len(names), MOST_DOTS)
     if len(kept) < len(names):
         facts.notes.append(f"Showing {len(kept):,} of {len(names):,} samples, evenly spread.")
     used = sorted(set(labels[kept].tolist()))

@@ -30,7 +30,7 @@ def scores_page(
 ) -> str:
     """Returns the page. labels: i (S), -1 = unknown. scores: f (S,C). streams: further scores (S,C) by name, such as static.
 
-    The first 5,000 samples become rows; the counts of right ones are of all samples. Scores that are no probabilities (each row
+    The first 5,000 samples become rows; the counts of right ones are of all samples. Scores that are not probabilities (each row
     positive with sum 1) are called scores.
     """
     shown = min(len(names), MOST_ROWS)

@@ -6,7 +6,6 @@ both take balanced accuracy and macro F1 from the same functions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,14 +126,6 @@ def _check(scores: np.ndarray, labels: np.ndarray) -> None:
     if wrong.any():
         first = int(wrong.argmax())
         raise DataError(f"label {labels[first]} of sample {first} is out of range; expected 0..{scores.shape[1] - 1}")
-
-
-def classification_merge(parts: Iterable[ClassificationStatistics]) -> ClassificationStatistics:
-    """Returns the statistics of all parts together, equal to those of all samples at once. Raises DataError without parts."""
-    parts = list(parts)
-    if not parts:
-        raise DataError("no statistics to merge: evaluate at least one shard")
-    return sum(parts[1:], parts[0])
 
 
 def class_recall(hits: np.ndarray, support: np.ndarray) -> np.ndarray:

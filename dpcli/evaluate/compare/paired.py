@@ -110,21 +110,6 @@ def evaluate_compare(
     return CompareReport(sources, options, resampling, parts, (sides[0][0].provenance, sides[1][0].provenance), notes)
 
 
-def compare_metrics(
-    a: FileMetrics,
-    b: FileMetrics,
-    resampling: Resampling,
-    options: EvaluationOptions | None = None,
-    *,
-    intersect: bool = False,
-) -> CompareReport:
-    """Compares the metrics of two predictions, such as the tables of two videos that `metrics_of_values` takes."""
-    part = pair_metrics(a, b, resampling, intersect=intersect)
-    return CompareReport(
-        (a.source, b.source), options or EvaluationOptions(), resampling, [part], (a.provenance, b.provenance)
-    )
-
-
 def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, intersect: bool = False) -> Paired:
     """Compares the metrics of two predictions of one task.
 

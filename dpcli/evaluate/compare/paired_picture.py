@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import save_figure
 from dpcli.evaluate.compare.number_text import metric_title
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
 
@@ -26,7 +27,7 @@ def draw_comparison(report: CompareReport, path: Path) -> None:
         _differences_panel(place, group)
     _samples_panel(axes[-1], part)
     figure.suptitle(f"A: {report.sources[0]}\nB: {report.sources[1]}", fontsize=9, parse_math=False)
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path)
 
 
 def _differences_panel(axes, group: dict[str, Change]) -> None:

@@ -16,9 +16,9 @@ from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, 
 from dpcli.evaluate.compare.measure_file import measure_file
 from dpcli.evaluate.results import samples_json
 from dpcli.evaluate.video.sources.open_source import is_media
+from dpcli.store.file import is_hdf5
 from dpcli.text_files import parse_json, read_text
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
 
 
@@ -100,7 +100,7 @@ def evaluate_runs(
     runs = [
         run
         for path, source in zip(paths, sources or map(str, paths), strict=True)
-        for run in (_file_runs if is_media(path) or _is_hdf5(path) else _json_runs)(path, source, options)
+        for run in (_file_runs if is_media(path) or is_hdf5(path) else _json_runs)(path, source, options)
     ]
     for run in runs[1:]:
         _check_same_experiment(runs[0], run)
@@ -109,14 +109,6 @@ def evaluate_runs(
     return RunsReport(
         runs[0].task, runs, runs[0].units, confidence, str(samples.get("kind", "")), int(samples.get("number", 0))
     )
-
-
-def _is_hdf5(path: Path) -> bool:
-    try:
-        with open(path, "rb") as file:
-            return file.read(len(_HDF5)) == _HDF5
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from None
 
 
 def _file_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]:

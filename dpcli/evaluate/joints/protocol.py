@@ -103,7 +103,7 @@ def evaluate_joints(
 
 
 def _visibly(reader: CloudsReader, row: int, truth: CloudSequence) -> Callable[[int, int], bool]:
-    """Returns whether a sequence's child moves visibly against its parent; nobody knows without poses: never."""
+    """Returns whether a sequence's child moves visibly against its parent; without poses this is unknown, and no child does."""
     pose = reader.read(row, fields=("pose",)).pose if "pose" in reader.fields else None
 
     def moves(child: int, parent: int) -> bool:

@@ -1,4 +1,4 @@
-"""Tells which true joints move visibly: of the others nobody can say the type or the axis."""
+"""Tells which true joints move visibly; type and axis of the others can't be seen."""
 
 from __future__ import annotations
 

@@ -143,42 +143,6 @@ def spherical(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return 2 * np.arcsin(np.minimum(chord / 2, 1)) ** 2
 
 
-def clip_similarity(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Returns Consistent4D's CLIP score: mean cosine of frames with their truth, f (T,D). Raises DataError for T = 0."""
-    return float(cosines(*_some(predicted, truth)).mean())
-
-
-def clip_spherical(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Returns 4DGen's CLIP score: mean spherical distance of frames to their truth, f (T,D). Raises DataError for T = 0."""
-    return float(spherical(*_some(predicted, truth)).mean())
-
-
-def clip_across_views(
-    embeddings: np.ndarray,  # [V, T, D]
-) -> float:
-    """Returns the mean cosine over pairs of views at one time (thesis, C.1.4). Raises DataError for fewer than two views."""
-    views = len(embeddings)
-    if embeddings.ndim != 3 or views < 2 or embeddings.shape[1] < 1:
-        raise DataError(f"CLIP across views needs two views or more, (V,T,D), but was given {embeddings.shape}")
-    first, second = np.triu_indices(views, 1)
-    return float(cosines(embeddings[first], embeddings[second]).mean())
-
-
-def clip_temporal(
-    embeddings: np.ndarray,  # [T, D]
-) -> float:
-    """Returns the mean cosine of consecutive frames of one view. Raises DataError for fewer than two frames."""
-    if embeddings.ndim != 2 or len(embeddings) < 2:
-        raise DataError(f"CLIP over time needs two frames or more, (T,D), but was given {embeddings.shape}")
-    return float(cosines(embeddings[1:], embeddings[:-1]).mean())
-
-
-def _some(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if len(predicted) == 0:
-        raise DataError("no frames to compare by CLIP")
-    return predicted, truth
-
-
 def _unit(embeddings: np.ndarray) -> np.ndarray:
     """Returns embeddings f (...,D) as f64 of length 1."""
     embeddings = np.asarray(embeddings, np.float64)

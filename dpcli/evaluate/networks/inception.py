@@ -12,9 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-FEATURES = 2048
 SIDE = 299  # pixels
-Size = int | tuple[int, int]
 
 
 class Conv(nn.Module):

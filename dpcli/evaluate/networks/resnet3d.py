@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-FEATURES = 2048
 BLOCKS = (3, 4, 6, 3)
 
 

@@ -163,6 +163,6 @@ def _check_digest(found: str, weights: Weights) -> Checked:
 
 
 def check_weights(weights: Weights, folder: Path, digest: bool = True) -> Checked:
-    """Checks an entry with all files beside it: the first that isn't present speaks for all."""
+    """Checks an entry with all its files; the state is that of the first one that isn't present."""
     found = [check_file(folder / each.file, each, digest) for each in weights.files]
     return next((each for each in found if each.state != "present"), found[0])

@@ -37,7 +37,7 @@ def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str
     return _svg(words, bars + middle + _axes(edges[0], edges[-1], 0, most, unit)) + _caption(words)
 
 
-def curve(name: str, values: Sequence[float | None], unit: str = "") -> str:
+def curve(name: str, values: Sequence[float | None]) -> str:
     """Returns a curve of a value for each frame as SVG, with gaps where it is None."""
     known = [value for value in values if value is not None]
     low, high = min(known), max(known)
@@ -50,10 +50,8 @@ def curve(name: str, values: Sequence[float | None], unit: str = "") -> str:
         else:
             path += f"{'L' if path else 'M'}{place(frame):.1f} {_level((value - low) / span):.1f}"
     lines = "".join(f'<path class="line" d="{own}"/>' for own in runs)
-    words = (
-        f"{name} by frame: {text_of(low, unit)} to {text_of(high, unit)}, mean {text_of(sum(known) / len(known), unit)}"
-    )
-    return _svg(words, lines + _axes(0, len(values) - 1, low, high, "", unit)) + _caption(words)
+    words = f"{name} by frame: {text_of(low)} to {text_of(high)}, mean {text_of(sum(known) / len(known))}"
+    return _svg(words, lines + _axes(0, len(values) - 1, low, high, "")) + _caption(words)
 
 
 def _scale(low: float, high: float):
@@ -65,14 +63,14 @@ def _level(share: float) -> float:
     return _HEIGHT - _BOTTOM - share * (_HEIGHT - _BOTTOM - _TOP)
 
 
-def _axes(left: float, right: float, low: float, high: float, unit: str, side: str = "") -> str:
+def _axes(left: float, right: float, low: float, high: float, unit: str) -> str:
     place, base = _scale(left, right), _level(0)
     ticks = "".join(
         f'<text x="{place(value):.1f}" y="{base + 16:.1f}" text-anchor="{anchor}">{escape(text_of(_round(value), unit))}</text>'
         for value, anchor in ((left, "start"), ((left + right) / 2, "middle"), (right, "end"))
     )
     ends = "".join(
-        f'<text x="{_LEFT - 5}" y="{_level(share) + 4:.1f}" text-anchor="end">{escape(text_of(value, side))}</text>'
+        f'<text x="{_LEFT - 5}" y="{_level(share) + 4:.1f}" text-anchor="end">{escape(text_of(value))}</text>'
         for share, value in ((0, low), (1, high))
     )
     return f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - 10}" y1="{base:.1f}" y2="{base:.1f}"/>{ticks}{ends}'
@@ -90,7 +88,7 @@ def _caption(words: str) -> str:
     return f'<p class="faint">{escape(words)}.</p>'
 
 
-def confusion_grid(confusion: np.ndarray, names: Sequence[str], unit: str = "samples") -> str:
+def confusion_grid(confusion: np.ndarray, names: Sequence[str]) -> str:
     """Returns a confusion matrix, counts i64 (C,C), rows truth, as a table colored by the share of the row.
 
     A line of words below it tells of the cell in focus.
@@ -108,7 +106,7 @@ def confusion_grid(confusion: np.ndarray, names: Sequence[str], unit: str = "sam
         for row, title in enumerate(titles)
     )
     return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="Confusion matrix"><table class="grid" data-unit="{escape(unit)}">'
+        '<div class="wide" tabindex="0" role="region" aria-label="Confusion matrix"><table class="grid" data-unit="samples">'
         f'<thead><tr><th scope="col">truth \\ predicted</th>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
         '<p class="faint says" aria-live="polite">Point at a cell, or move among them with the arrow keys.</p>'
     )

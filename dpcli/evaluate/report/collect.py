@@ -13,10 +13,10 @@ from dpcli.evaluate.report.blocks import Figure, Table
 from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+from dpcli.store.file import MAGIC, is_hdf5
 from dpcli.store.pipes import standard_input
 from dpcli.text_files import distinct_keys
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 _EXPECTED = (
     "expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
     "or a video as PRED=TRUTH"
@@ -71,9 +71,9 @@ def _results_of(
     if argument == "-":
         return _parse_objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _split_pair(argument)
-    if path.is_file() and not _is_hdf5(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
+    if path.is_file() and not is_hdf5(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
         return _parse_objects(path.read_bytes(), str(path), pictures)
-    kind = file_kind(path) if path.is_file() and _is_hdf5(path) else "video"
+    kind = file_kind(path) if path.is_file() and is_hdf5(path) else "video"
     if kind == "scores":
         return [_scores_result(path, own, split)]
     if kind == "parts":
@@ -94,14 +94,9 @@ def _split_pair(argument: str) -> tuple[Path, Path | None]:
     return Path(argument[:cut]), Path(argument[cut + 1 :])
 
 
-def _is_hdf5(path: Path) -> bool:
-    with open(path, "rb") as file:
-        return file.read(len(_HDF5)) == _HDF5
-
-
 def _parse_objects(data: bytes, source: str, pictures: bool) -> list[CollectedResult]:
     """Returns result objects from text: one object, a list of them, or one on each line."""
-    if data.startswith(_HDF5):
+    if data.startswith(MAGIC):
         raise DataError(f"{source}: an HDF5 file; save it and name it (the report reads it more than once)")
     try:
         text = data.decode("utf-8-sig")
@@ -141,7 +136,7 @@ def _strict_json(text: str) -> Any:
     """Returns what JSON says. Raises ValueError for NaN and Infinity, which no result has."""
 
     def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no number")
+        raise ValueError(f"{name} is not a number")
 
     try:
         return json.loads(text, parse_constant=refuse, object_pairs_hook=distinct_keys)
@@ -150,7 +145,7 @@ def _strict_json(text: str) -> Any:
 
 
 def _check_result(found: Any, where: str) -> dict[str, Any]:
-    """Returns the object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
+    """Returns the object if it has the structure of a result, of whatever task. Raises DataError if not."""
     if not isinstance(found, dict) or not isinstance(found.get("task"), str):
         shown = (
             f"an object with {', '.join(list(found)[:5]) or 'nothing'}"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.draw.palette import PALETTE, UNKNOWN
+from dpcli.draw.sheet import spread_evenly
 from dpcli.evaluate.proportions import mean_defined
 from dpcli.evaluate.report.blocks import Figure, Table, cell, table, text_of
 from dpcli.evaluate.report.charts import histogram
@@ -51,12 +52,10 @@ class Cloud:
     unit: str
 
 
-def part_blocks(
-    path: Path, truth: Path, *, split: str | None = None, motion: bool = False, intersect: bool = False
-) -> list[Table | Figure]:
+def part_blocks(path: Path, truth: Path, *, split: str | None = None, motion: bool = False) -> list[Table | Figure]:
     """Returns how errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
     fields = ("part", "pose") if motion else ("part",)
-    with PairedSequences(path, truth, split=split, intersect=intersect, fields=fields) as paired:
+    with PairedSequences(path, truth, split=split, fields=fields) as paired:
         errors = [_sequence_error(row, paired.pair(place), motion) for place, row in enumerate(paired.rows)]
         known = [own for own in errors if not np.isnan(own.mean)]
         shown = _choose_sequences(known)
@@ -115,7 +114,7 @@ def _read_cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: s
             error = _flow_error(pair, *pair.parts.pairs[row].tolist(), pair.parts.flow[row])
         else:
             unit = ""
-    keep = np.unique(np.linspace(0, len(error) - 1, min(len(error), _MOST_POINTS)).round().astype(int))
+    keep = spread_evenly(len(error), _MOST_POINTS)
     return Cloud(truth.points[span][keep], truth.part[span][keep], part[keep], error[keep], unit)
 
 

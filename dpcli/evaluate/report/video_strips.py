@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import spread_evenly
 from dpcli.evaluate.report.blocks import Figure
 
 _INSTANTS, _MOST_VIEWS, _QUALITY = 6, 4, 82
@@ -30,7 +31,7 @@ def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", backgro
         pairs = match_views(source, true_source, chosen, True, [])
         for ours, theirs in pairs[:_MOST_VIEWS]:
             count = min(one.frames[view] for one, view in ((source, ours), (true_source, theirs)) if one.frames)
-            shown = np.unique(np.linspace(0, count - 1, _INSTANTS).round().astype(int)).tolist()
+            shown = spread_evenly(count, _INSTANTS)
             pictures = zip(shown, source.pictures(ours, shown), true_source.pictures(theirs, shown), strict=True)
             for frame, predicted_picture, true_picture in pictures:
                 strip(true_source.views[theirs], frame, count, predicted_picture, true_picture)

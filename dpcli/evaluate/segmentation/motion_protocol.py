@@ -134,7 +134,7 @@ def _check_found(statistics: list[MotionStatistics], without_truth: int, path: s
     if not statistics:
         why = "holds no frame pairs; sequences of one frame have no motion"
         if without_truth:
-            why = f"none of its {without_truth} frame pairs is f -> f + 1, of which alone scene_flow tells"
+            why = f"none of its {without_truth} frame pairs is f -> f + 1, the only ones that scene_flow describes"
     raise DataError(f"{path}: nothing to compare: {why}")
 
 

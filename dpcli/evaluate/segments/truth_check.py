@@ -1,4 +1,4 @@
-"""Doubts about a table of true segments: classes that nobody predicts, and frames that count in another way than ours."""
+"""Doubts about a table of true segments: classes that are never predicted, and frames counted in another way than ours."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ def _choose_metrics(asked: Sequence[str] | None, predicted: Source, truth: Sourc
         return possible
     for name in asked:
         if name == "psnr_foreground" and not truth.has_alpha:
-            raise DataError(f"{truth.path}: no alpha, so nobody knows the object's pixels; leave out psnr_foreground")
+            raise DataError(f"{truth.path}: no alpha, so the object's pixels are unknown; leave out psnr_foreground")
         if name == "silhouette_iou" and not silhouettes:
             bare = predicted if truth.has_alpha else truth
             raise DataError(f"{bare.path}: no alpha, so it has no silhouette; leave out silhouette_iou")

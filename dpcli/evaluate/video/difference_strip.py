@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
+from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture, spread_evenly
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, View
 
@@ -25,7 +25,7 @@ class DifferenceStrip:
         self.rows: dict[str, list[tuple[int, np.ndarray]]] = {}
 
     def __call__(self, view: View, frame: int, frames: int, predicted: Picture, truth: Picture) -> None:
-        shown = np.unique(np.linspace(0, frames - 1, _INSTANTS).round().astype(int))
+        shown = spread_evenly(frames, _INSTANTS)
         title = f"view {view.title} ({view.role}): truth, prediction, 4 x difference"
         if frame not in shown or (title not in self.rows and len(self.rows) == _MOST_VIEWS):
             return

@@ -1,4 +1,4 @@
-"""SSIM and MS-SSIM of pictures, and the float64 twin of SSIM that tests trust."""
+"""SSIM and MS-SSIM of pictures, and the float64 twin of SSIM as the tests' reference."""
 
 from __future__ import annotations
 

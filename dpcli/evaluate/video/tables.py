@@ -152,7 +152,7 @@ def video_notes(report: VideoReport) -> list[str]:
     if "parts" in report.scene:
         lines.append(
             f"Parts: each true surface point takes the part of its {PART_NEIGHBORS} nearest Gaussians (opacity >= {SOLID:g}, "
-            f"weight opacity / distance) in the first frame; k-means is told the true number of parts; "
+            f"weight opacity / distance) in the first frame; k-means is given the true number of parts; "
             f"{report.scene['parts'].unknown} points without a true part left out."
         )
     if "tracks" in report.scene:

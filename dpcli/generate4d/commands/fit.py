@@ -31,7 +31,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.runtime.whole_file import PICTURES, check_target, whole_file
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write_scene
 from dpcli.store.writing.already_made import already_made
@@ -114,8 +114,7 @@ def _optimize(optimizer: SceneOptimizer, folder: RunFolder, settings: str) -> tu
     )
     keep_freed_memory()
     with folder, stop_requested() as stop:
-        with whole_file(folder.file("settings.toml")) as part:
-            part.write_text(settings, encoding="utf-8")
+        folder.write_settings(settings)
         fit = FitRun(optimizer, folder, stop, _preview_writer(folder, targets))
         model = fit.run().cpu()
         model.refresh_neighbors()
@@ -162,8 +161,8 @@ def _preview_writer(folder: RunFolder, targets: Targets) -> Callable[[Model4D], 
     def write(model: Model4D) -> None:
         first = not path.exists()
         write_preview(model, targets, path)
-        if first:  # before the first step: whoever waits can look at the start from all sides
-            log.info(f"{path}: a look at it from all sides, drawn again as the fit goes on")
+        if first:  # before the first step, so that the start can be looked at from all sides
+            log.info(f"{path}: a preview from all sides, updated as the fit goes on")
 
     return write
 

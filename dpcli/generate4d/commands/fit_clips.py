@@ -56,7 +56,7 @@ def fit_clips(
 ) -> FittedClips:
     """Fits each views file to a scene in `folder`, under the views file's name; clips that are finished are left as they are.
 
-    A clip that can't be fitted, or that takes down whoever fits it, is named, and the others go on. Nothing is merged: the
+    A clip that can't be fitted, or whose process dies, is named, and the others go on. Nothing is merged: the
     scenes of all shards lie in one folder. Raises UsageError for `-` and for an output that is no folder, Stopped after a
     stop signal.
     """

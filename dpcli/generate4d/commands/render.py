@@ -76,7 +76,7 @@ def _check_views(output: str | None, settings: RenderSettings, look: Look, *, ha
         unused += ["background"] if look.background not in (None, LIGHT.background) else []
     if unused:
         raise UsageError(
-            f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
+            f"{', '.join(unused)}: cannot be used with --cameras, whose file says from where, how large and when every picture"
             " is, with a transparent background; leave out one or the other"
         )
 

@@ -24,7 +24,6 @@ from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import Generate4DStream, torch_seed
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.runtime.whole_file import whole_file
 
 HELD_OUT_ROUND = 1 << 20  # the number of the round that validates: no training gets so far
 
@@ -56,8 +55,7 @@ def train_shape_prior(
     notes = {"command": provenance.command_line(), "seed": seed, "trained_on": models}
     keep_freed_memory()
     with folder:
-        with whole_file(folder.file("settings.toml")) as part:
-            part.write_text(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
+        folder.write_settings(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
         kept = draw_round(held(HELD_OUT_ROUND, settings.data.validation))
         weights = sum(value.numel() for value in model.parameters())
         log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")

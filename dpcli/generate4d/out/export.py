@@ -53,13 +53,7 @@ def export_file(
 
 
 def export_sequence(
-    scene: GaussianScene,
-    folder: Path,
-    form: str,
-    *,
-    axes: str = "player",
-    times: Sequence[float] | None = None,
-    force: bool = False,
+    scene: GaussianScene, folder: Path, form: str, *, axes: str = "player", force: bool = False
 ) -> list[Path]:
     """Writes frame0001.ply (or .splat), ... into `folder`, cameras and metrics as .json beside it; returns the frames' paths.
 
@@ -74,13 +68,12 @@ def export_sequence(
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
     check_replaced(folder, ("frame*.ply", "frame*.splat", "frame*.spz", "cameras.json", "metrics.json"))
-    times = scene.time.tolist() if times is None else list(times)
-    width = max(4, len(str(len(times))))
-    names = [f"frame{number:0{width}d}.{form}" for number in range(1, len(times) + 1)]
+    width = max(4, len(str(scene.num_frames)))
+    names = [f"frame{number:0{width}d}.{form}" for number in range(1, scene.num_frames + 1)]
     try:
         with whole_file(folder) as part:
             _make_folder(part, folder)
-            for name, time in zip(names, times, strict=True):
+            for name, time in zip(names, scene.time.tolist(), strict=True):
                 export_file(scene, part / name, form, time=time, axes=axes)
         cameras, metrics = tables_beside(folder)
         write_json(cameras, camera_list(scene, axes))

@@ -25,7 +25,7 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict, *, calm: bool = Fa
     Parts are found again on the whole motion, but where the settings leave the temporal cue out: those of its network
     then stand. A part's motion is the one that best explains where its Gaussians went (weighted Kabsch, weights part probability
     times opacity), which is also what a fit without rigid motion can be asked for. calm: motion along the reference
-    view's line of sight comes from layers that differ from frame to frame, and only its slow share is believed.
+    view's line of sight comes from layers that differ from frame to frame, and only its slow share is kept.
     """
     gaussians, control = model.gaussians, model.control
     motion = _motion_of_frames(model, targets)

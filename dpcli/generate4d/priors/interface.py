@@ -16,8 +16,6 @@ RelativeCamera = tuple[float, float, float]  # azimuth, elevation (radians), rad
 class Prior(Protocol):
     """Judges renders from cameras that the video doesn't show. `progress` and `generator` make it repeatable."""
 
-    needs_renders: bool  # False: `loss` ignores renders and the caller needn't make any
-
     def prepare(
         self,
         reference_frames: np.ndarray,  # [T, H, W, 4]

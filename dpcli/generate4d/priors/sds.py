@@ -79,8 +79,6 @@ class ScoreDistillation:
     the other; slower, same loss up to rounding.
     """
 
-    needs_renders = True
-
     def __init__(
         self,
         model: Zero123Model,

@@ -27,12 +27,6 @@ class Motion:
     part_quaternion: Tensor  # [B, S, 4]
     part_translation: Tensor  # [B, S, 3]: x -> R_s x + t_s
 
-    def part_matrix(self) -> Tensor:  # [B, S, 4, 4]
-        """Returns T_s^tau, which takes canonical positions of a part to those at the time."""
-        matrix = torch.eye(4).to(self.part_translation).expand(*self.part_translation.shape[:2], 4, 4).clone()
-        matrix[..., :3, :3], matrix[..., :3, 3] = quaternion_to_matrix(self.part_quaternion), self.part_translation
-        return matrix
-
 
 def encode(
     values: Tensor,  # [..., D]

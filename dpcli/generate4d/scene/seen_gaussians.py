@@ -1,4 +1,4 @@
-"""Chooses which Gaussians of a fitted scene may speak for its motion: what is hidden moves as the network continues it."""
+"""Chooses the Gaussians of a fitted scene whose motion can be trusted; hidden ones move as the network extrapolates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _CELLS, _BEHIND = 96, 0.02  # of the depth buffer along a side; depth in diamete
 def trust(
     frames: np.ndarray, solid: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Returns which Gaussians may speak for the motion, bool (N): solid ones (mask (N)) that some view often sees.
+    """Returns which Gaussians have a motion that can be trusted, bool (N): solid ones (mask (N)) that some view often sees.
 
     frames: f (T,N,3); poses (V,4,4), intrinsics (V,3,3) and the size of pictures are those of the fitted views. Where
     they see too small a share, as from an animal's front, all solid ones do; where nothing is solid, all do.

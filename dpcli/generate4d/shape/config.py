@@ -19,9 +19,9 @@ class ShapeConfig:
         least=1,
         most=WIDEST,
     )
-    hidden: int = setting(128, "Width of the layers that name the angles.", least=1, most=WIDEST)
+    hidden: int = setting(128, "Width of the layers that predict the angles.", least=1, most=WIDEST)
     bins: int = setting(15, "Bins of each angle.", least=2, most=360)
-    lengths: bool = setting(False, "Whether the length along the line of sight is named, too, in as many bins.")
+    lengths: bool = setting(False, "Whether the length along the line of sight is predicted, too, in as many bins.")
 
     def __post_init__(self) -> None:
         check(self)

@@ -39,7 +39,7 @@ def inlined(function: Callable) -> Callable:
 
 
 def arithmetic_kernel(function: Callable) -> Callable:
-    """Compiles as `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
+    """Compiles as `kernel`, but infinities and NaN pass through as IEEE 754 has them: for values that were not checked."""
     return _compiled(function, nogil=True, error_model="numpy")
 
 

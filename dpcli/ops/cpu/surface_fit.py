@@ -24,7 +24,7 @@ def fit_rows(features, bias, floor, xyz, at, times, logits, weights, moments, si
     or nothing: coordinates that become group `at`, whose bias is 0 and whose floor is low. times (R). logits (R*groups), or
     nothing for weights of 1; weights (R*groups) = sigmoid(logits). moments (centroids*entries*groups): for each
     feature a the sums of w x_a x_b for b = 0..a, of w x_a and of w x_a t; last of w and of w t.
-    NaN stays NaN: whoever watches the loss has to see it.
+    NaN stays NaN, so that it shows in the loss.
     """
     weighted, zero, one = logits.size > 0, lanes(np.float32(0)), lanes(np.float32(1))
     most, base2, endless = lanes(np.float32(126)), lanes(np.float32(-_LOG2E)), lanes(np.float32(np.inf))

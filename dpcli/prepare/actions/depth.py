@@ -233,7 +233,7 @@ class DepthVideos:
 
     def _scale(self, video: DepthVideo) -> tuple[float, bool]:
         """Returns raw units per meter (the user's, the calibration's, the recording's, or what is usual for the type of
-        number) and whether somebody said them.
+        number) and whether they were given.
         """
         kind = video.frames.dtype
         if self.calibration and not self.depth_scale and kind.kind != "f":

@@ -22,7 +22,7 @@ _ROWS = 16  # of a frame that are looked at
 
 
 def usual_scale(kind: np.dtype) -> float:
-    """Returns raw units per meter when nobody says them: millimeters in whole numbers, centimeters in 8 bits, or meters."""
+    """Returns raw units per meter where they are not given: millimeters in whole numbers, centimeters in 8 bits, or meters."""
     return 1.0 if kind.kind == "f" else 100.0 if kind.itemsize == 1 else 1000.0
 
 

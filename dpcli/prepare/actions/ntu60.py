@@ -260,7 +260,7 @@ class NTU60:
         frames, others = self._frames(item, where)
         numbers = np.array([number for number, _ in frames])
         if len(set(numbers)) < len(numbers):
-            raise DataError(f"{where}: a frame is there twice; expected one MDepth-00000001.png per number")
+            raise DataError(f"{where}: a frame occurs twice; expected one MDepth-00000001.png per number")
         clouds = []
         for number, data in frames:
             data = data.read_bytes() if isinstance(data, Path) else data

@@ -48,7 +48,7 @@ def open_preprocessed(
             raise UsageError("--scale: pts_label.npy holds pixels, which are kept; leave it out")
         return PtsLabel(raw, labels, lists)
     if lists is not None:
-        raise UsageError(f"--lists: the names of {form}'s files tell label and split; leave it out")
+        raise UsageError(f"--lists: the names of {form}'s files give label and split; leave it out")
     return PeerClouds(raw, form, protocol, scale)
 
 

@@ -169,7 +169,7 @@ def idle_joints(obj: ArticulatedObject, least: float, visible_only: bool, rng: n
 
     ``least``: a fraction of the object's diameter that some point of the surface must move by. With ``visible_only``
     a tenth of the moved surface must come to lie that far from where surface was: a wheel that spins about its own axis
-    moves its points but not its shape, which nobody can see in points that are drawn anew in every frame.
+    moves its points but not its shape, which can't be seen in points that are sampled anew in every frame.
     """
     middle = np.array([[(joint.lower + joint.upper) / 2 for joint in obj.joints]])
     poses = obj.poses(obj.follow(middle))[0]

@@ -114,7 +114,7 @@ def _misplaced(data: Path, name: str) -> str:
     try:
         path_inside(data, data, name)
     except DataError as error:
-        return f"{data}: a list names a folder that is no room: {error}"
+        return f"{data}: a list names a folder that is not a room: {error}"
     return ""
 
 

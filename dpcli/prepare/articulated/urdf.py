@@ -239,7 +239,7 @@ def _roll_pitch_yaw(path: Path, text: str) -> list[float]:
     try:
         return Rotation.from_quat([float(word) for word in text.split()]).as_euler("xyz").tolist()
     except ValueError:
-        raise DataError(f"{path}: quat_xyzw {text!r} is no rotation; expected four numbers, not all zero") from None
+        raise DataError(f"{path}: quat_xyzw {text!r} is not a rotation; expected four numbers, not all zero") from None
 
 
 def _capsules(root: Any) -> list[tuple[int, str, int]]:

@@ -95,7 +95,7 @@ def _as_stored(folder: Path, tail: str) -> str:
 def is_missing(path: Path, name: str, root: Path | None) -> str:
     """Returns what is said of a mesh that isn't there, and where it lies when that is outside ``root``."""
     if root is not None and resolve(path, name, None).is_file():
-        return f"{name} lies outside the folder {root}: name a folder above it (or --allow-outside)"
+        return f"{name} is outside the folder {root}: name a folder above it (or --allow-outside)"
     return f"{name} is missing"
 
 

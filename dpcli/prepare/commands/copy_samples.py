@@ -19,7 +19,7 @@ class Copy:
     """Says what is copied: the samples of these names, in their order, into a file with the look of `pattern`.
 
     skipped: (name, reason) of samples that the file says are left out. where: the file's name in the message of a stop.
-    resume: off where nobody could run it again (a pipe).
+    resume: off where it can't be run again (a pipe).
     """
 
     output: Path

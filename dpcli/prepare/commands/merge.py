@@ -34,7 +34,7 @@ def merge(
 
     All shards of one run become, byte for byte, the file of a single run: order restored, provenance the whole's. Other
     clouds files follow one another as given; their class lists must agree unless `labels` maps them.
-    prefix: names become FILE/NAME, FOLDER/NAME for files of one name. resume: off where nobody could run it again
+    prefix: names become FILE/NAME, FOLDER/NAME for files of one name. resume: off where it can't be run again
     (a pipe); saves the journal's disk space. UsageError: missing, repeated or mixed shards, `output` or what a stopped
     run left of it is there and another; DataError: classes, units or fields that disagree, a name twice; Stopped after
     a stop signal.

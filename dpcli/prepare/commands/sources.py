@@ -21,7 +21,7 @@ class Source:
     """Holds what the index of one file says; its points stay on the disk.
 
     made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped,
-    where the file is a shard. parts: of how many its poses and joints speak. prefix: what goes before its samples'
+    where the file is a shard. parts: how many its poses and joints have. prefix: what goes before its samples'
     names in the joined file.
     """
 

@@ -65,7 +65,7 @@ class SplitChoice:
             strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
             return draw_splits(groups, strata, self.fractions, self.seed)
         if not any(splits):
-            raise DataError(f"{source.path}: tells no splits; choose --list, --subjects or --fractions")
+            raise DataError(f"{source.path}: has no splits; choose --list, --subjects or --fractions")
         return list(splits)
 
 

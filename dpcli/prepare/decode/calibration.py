@@ -78,7 +78,7 @@ def read_calibration(path: Path) -> Calibration:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise DataError(f"{path}: is no text; {_EXPECTED}") from None
+        raise DataError(f"{path}: is not text; {_EXPECTED}") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     if (cameras := _colmap_lines(text)) and path.suffix.lower() == ".txt":

@@ -163,8 +163,8 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
         log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
     if not quiet and (cameras := _cameras_beside(folder)):
         log.warn(
-            f"{folder}: {first_names(cameras)}: not read; the camera of a clip is taken to stand still, and where it moves the "
-            "object seems to. Cameras are read from transforms.json, with a time for each frame"
+            f"{folder}: {first_names(cameras)}: not read; the camera of a clip is assumed to stand still; if it moves, the "
+            "object will seem to. Cameras are read from transforms.json, with a time for each frame"
         )
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})

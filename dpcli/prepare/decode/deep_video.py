@@ -83,7 +83,7 @@ class _Stamps:
             for line in pipe:
                 if match := _STAMP.search(line):
                     self._add(float(match[1]) if re.fullmatch(rb"-?[\d.]+(e-?\d+)?", match[1]) else None)
-        except ValueError:  # closed, because nobody wants more frames
+        except ValueError:  # closed, because no more frames are needed
             pass
         with self.news:
             self.ended = True

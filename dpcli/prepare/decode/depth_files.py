@@ -254,7 +254,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def has_white_at_zero(data: bytes) -> bool:
-    """Returns whether the bytes are those of a TIFF that says its 0 is white; what that means for depth, nobody says."""
+    """Returns whether the bytes are those of a TIFF that says its 0 is white, which has no defined meaning for depth."""
     if not data.startswith((b"II", b"MM")):
         return False
     from PIL import Image

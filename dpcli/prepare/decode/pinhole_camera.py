@@ -37,7 +37,7 @@ class Intrinsics:
         320.0
         """
         if not 0 < degrees < 180:
-            raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
+            raise UsageError(f"a field of view is between 0 and 180 degrees, found {degrees:g}")
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
         return cls(focal, focal, (width - 1) / 2, (height - 1) / 2)
 

@@ -152,6 +152,6 @@ def _check_size(data: bytes, where: str | Path) -> None:
             size = image.size
     except Image.DecompressionBombError as error:
         raise DataError(f"{where}: {str(error)[:80]}; {len(data)} bytes of a file can't hold such a picture") from None
-    except Exception:  # nearly anything; whoever decodes it says that it can't be read
+    except Exception:  # nearly anything; decoding will say that it can't be read
         return
     require_plausible(where, *size, len(data))

@@ -138,7 +138,7 @@ def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool
     yaw: radians about the upright, y. travel=False: takes out the level (x, z) motion of the middle, as on a treadmill.
     """
     seen = mesh.seen_corners()
-    seen[:, np.unique(mesh.triangles)] |= not seen.any()  # nothing has an area: whoever draws points refuses it
+    seen[:, np.unique(mesh.triangles)] |= not seen.any()  # nothing has an area: drawing points will refuse it
     if not travel:
         middle = _middles(mesh.positions, seen) * [1, 0, 1]
         mesh = mesh.moved(np.eye(3), middle[0] - middle, 1.0)

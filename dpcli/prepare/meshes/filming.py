@@ -55,7 +55,9 @@ class Filming:
         turns = [round(azimuth % 360, 6) for azimuth in azimuths]
         twice = [azimuth for index, azimuth in enumerate(azimuths) if turns[index] in turns[:index]]
         if twice:
-            raise UsageError(f"azimuth {twice[0]:g} is there twice; 0 is the reference view, each may be used once")
+            raise UsageError(
+                f"azimuth {twice[0]:g} is given twice; 0 is the reference view, and each may be used only once"
+            )
 
     @property
     def config(self) -> dict[str, Any]:

@@ -301,7 +301,7 @@ def _check_stl(path: Path) -> None:
         return
     if end := _end_of_stl(data):
         with log.each_once(_SAID):
-            log.warn(f"{path}: {len(data) - end} bytes behind its {count} triangles were passed over")
+            log.warn(f"{path}: {len(data) - end} bytes behind its {count} triangles were ignored")
     elif _is_binary(data):
         _compare(path, "triangles", count, (len(data) - _STL_HEAD) // _STL_FACE)
         _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))

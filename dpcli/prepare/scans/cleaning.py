@@ -1,4 +1,4 @@
-"""Points that nobody measured: NaN, the origin where a scanner had no return, and numbers that stand for "nothing"."""
+"""Points that were not measured: NaN, the origin where a scanner had no return, and sentinels that stand for "nothing"."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
 
 
 def is_crowded(points: np.ndarray) -> bool:
-    """Returns whether a hundredth of some points (N,3) or more are at one place: nobody measured these, but they aren't the
+    """Returns whether a hundredth of some points (N,3) or more are at one place: these were not measured, but they aren't the
     origin, such as where a scanner's own axes were turned into those of a vehicle.
     """
     some = points[:: max(1, len(points) // _SAMPLED)]

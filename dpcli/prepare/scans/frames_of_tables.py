@@ -82,8 +82,8 @@ def frame_column(table: Table, wanted: str) -> str:
     found = wanted or find_frame_column(table.names)
     if not found:
         raise DataError(
-            f"{table.path}: which column numbers the frames? --frame-column NAME says it; found {known}."
-            " A table of one frame goes into a folder of frames"
+            f"{table.path}: which column numbers the frames? give --frame-column NAME; found {known}."
+            " Put a table of a single frame into a folder of frames"
         )
     return found
 

@@ -27,7 +27,7 @@ from dpcli.store import CloudSequence
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 MARGIN = 0.01  # meters by which a box is larger than its label says
-SCANS, LISTED = 7481, {"train": 3712, "val": 3769}
+SCANS = 7481
 _SPLITS = {"train": "train", "val": "validation"}
 
 
@@ -44,15 +44,15 @@ class Box:
     length: float
     rotation_y: float
 
-    def contains(self, points: np.ndarray, margin: float = MARGIN) -> np.ndarray:
+    def contains(self, points: np.ndarray) -> np.ndarray:
         """Returns bool (N), which points f64 (N,3) it holds; y points down: the box reaches from -height to 0 above its
         foot.
         """
         x, y, z = (points - self.foot).T
         cosine, sine = np.cos(self.rotation_y), np.sin(self.rotation_y)
         along, across = cosine * x - sine * z, sine * x + cosine * z
-        inside = (np.abs(along) <= self.length / 2 + margin) & (np.abs(across) <= self.width / 2 + margin)
-        return inside & (y >= -self.height - margin) & (y <= margin)
+        inside = (np.abs(along) <= self.length / 2 + MARGIN) & (np.abs(across) <= self.width / 2 + MARGIN)
+        return inside & (y >= -self.height - MARGIN) & (y <= MARGIN)
 
 
 def read_boxes(path: Path) -> list[Box]:

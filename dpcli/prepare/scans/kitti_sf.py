@@ -82,7 +82,7 @@ def class_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
     unknown = [name for name in names if name not in CLASSES]
     if unknown or not names:
         raise UsageError(
-            f"--objects {','.join(names)}: {', '.join(unknown) or 'nothing'} is no class of the instance "
+            f"--objects {','.join(names)}: {', '.join(unknown) or 'nothing'} is not a class of the instance "
             f"images; expected some of {', '.join(CLASSES)}"
         )
     return tuple(CLASSES[name] for name in names)

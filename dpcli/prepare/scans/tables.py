@@ -151,7 +151,7 @@ class TableSequences:
             raise DataError(f"{item.path}: no colors, though the first table of all has them")
         time = loaded.times(part, self.fps)
         if item.extra["time"] and time is None:
-            raise DataError(f"{item.path}: no column tells times that rise, though the first table has one")
+            raise DataError(f"{item.path}: no column holds rising times, though the first table has one")
         clouds = loaded.frames(part)[:: self.stride]
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
@@ -179,7 +179,7 @@ class TableSequences:
 
 @dataclass(frozen=True)
 class Loaded:
-    """Holds a table that was read: all its points, its sequences, the frame column, columns that nobody asked for, and the
+    """Holds a table that was read: all its points, its sequences, the frame column, columns that were not asked for, and the
     times that some of these tell.
     """
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.prepare.articulated.articulated_object import axis_rotation
 from dpcli.prepare.synthetic.creature import Creature
 
 X, Y, Z = np.eye(3)
@@ -110,7 +111,7 @@ def bone_motion(animal: Creature, turns: Turns, travel: np.ndarray) -> np.ndarra
     for index, bone in enumerate(animal.bones):
         local = np.tile(np.eye(4), (frames, 1, 1))
         for axis, angle in turns.get(bone.name, []):
-            local[:, :3, :3] = rotations(axis, angle) @ local[:, :3, :3]
+            local[:, :3, :3] = axis_rotation(axis, angle) @ local[:, :3, :3]
         local[:, :3, 3] = bone.pivot - local[:, :3, :3] @ bone.pivot
         if bone.parent < 0:
             local[:, :3, 3] += travel
@@ -118,11 +119,3 @@ def bone_motion(animal: Creature, turns: Turns, travel: np.ndarray) -> np.ndarra
         else:
             motion[:, index] = motion[:, bone.parent] @ local
     return motion
-
-
-def rotations(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Returns rotation matrices f64 (T,3,3) about a unit axis by angles (T), radians (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)

@@ -113,7 +113,7 @@ def _numbers(path: Path) -> np.ndarray:
     try:
         return np.array(rows, np.float64)
     except ValueError:
-        raise DataError(f"{path}: rows of different lengths, or words that are no numbers") from None
+        raise DataError(f"{path}: rows of different lengths, or words that are not numbers") from None
 
 
 def _text(path: Path) -> str:

@@ -13,7 +13,7 @@ from dpcli.runtime.progress import log
 
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
 _LABELS = 64  # values at most in an image of labels
-_VOID = 255  # beside small labels: in some data sets, such as PASCAL VOC, that nobody decided
+_VOID = 255  # beside small labels: in some data sets, such as PASCAL VOC, that it is undecided
 _WIDE_VOIDS = (10_000, 65_535)  # the same beside other labels of 16 bits, such as KITTI MOTS has them
 _COLORFUL = 48  # gray levels between channels: more than compression does to a gray mask
 _NOISE = 32  # gray levels: compression leaves no more where nothing is

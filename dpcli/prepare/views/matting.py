@@ -214,7 +214,7 @@ def cut_alone(rgba: np.ndarray, name: str, background: str, tolerance: float, ho
 
 
 def clear_invisible(rgba: np.ndarray) -> np.ndarray:
-    """Clears faint alpha to 0, and the color nobody sees to black: equal objects give equal bytes."""
+    """Clears faint alpha to 0, and invisible color to black: equal objects give equal bytes."""
     return rgba * (rgba[..., 3:] >= FAINT)
 
 

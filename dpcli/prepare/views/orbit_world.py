@@ -139,7 +139,7 @@ def _in_front(center: np.ndarray, poses: np.ndarray, rays: np.ndarray) -> np.nda
     together = rays.mean(axis=0)
     if np.linalg.norm(together) < 1 - _PARALLEL:
         raise DataError(
-            "the cameras don't look at one object that lies before all of them; are the poses of other pictures?"
+            "the cameras don't look at one object in front of all of them; do the poses belong to other pictures?"
         )
     return center + (1 - depths.min()) * together
 

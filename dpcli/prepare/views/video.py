@@ -76,7 +76,7 @@ class VideoOptions:
         if self.holes not in matting.HOLES:
             raise UsageError(f"--holes {self.holes}: expected {', '.join(matting.HOLES)}")
         if self.mask and self.background != "auto":
-            raise UsageError("--mask and --background were both given; a mask says by itself what the object is")
+            raise UsageError("--mask and --background were both given; a mask already says what the object is")
         if self.views_cameras and not self.views:
             raise UsageError("--views-cameras describes the cameras of --views FOLDER; give both")
         matting.named_background(self.background)

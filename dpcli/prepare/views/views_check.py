@@ -53,7 +53,7 @@ class ArtemisIndex:
         except DataError as error:
             return f"{self.animal / 'sequences'}: {error}"
         if not folder.is_dir():
-            return f"img/{name}: missing" + (f"; sequences tells of its {declared} frames" if declared else "")
+            return f"img/{name}: missing" + (f"; sequences gives it {declared} frames" if declared else "")
         try:
             motion = find_motion(self.animal, name)
         except DataError as error:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from dpcli.draw.sheet import save_figure
 from dpcli.reproduce.runs import markdown, write_text
 from dpcli.reproduce.scenes.table_5_2 import fit_all, mean_score, parser_of
 
@@ -63,7 +64,7 @@ def picture(found: Found, path: Path) -> None:
             axes.set(xscale="log", xlabel=SWEEPS[setting][0], title=title)
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
-    figure.savefig(path, dpi=120, format="png")
+    save_figure(figure, path, 120)
 
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:

@@ -51,11 +51,11 @@ def animation_times(path: Path) -> tuple[float, ...]:
     except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
     if len(times) > 1 and form == "TIFF":
-        raise DataError(f"{path}: {len(times)} pages, which tell no times; write each into a folder as an image")
+        raise DataError(f"{path}: {len(times)} pages without times; write each as an image into a folder")
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
     if (behind := pictures_in(path) - len(times)) > 0:
-        log.warn(f"{path}: {behind} pictures lie behind the {len(times)} that its header counts, and are left out")
+        log.warn(f"{path}: {behind} pictures follow the {len(times)} that its header counts, and are left out")
     return tuple(times)
 
 

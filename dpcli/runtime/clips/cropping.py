@@ -1,6 +1,6 @@
 """Margins that a video file hides: those around the clean aperture of MP4 and QuickTime, PixelCrop of Matroska.
 
-FFmpeg's decoders leave it to whoever shows them, and PyAV doesn't tell it, nor other boxes that describe a video.
+FFmpeg's decoders leave cropping to the program that shows the frames, and PyAV exposes neither it nor other boxes.
 """
 
 from __future__ import annotations

@@ -99,8 +99,8 @@ def _tell_unread_channel(path: Path, image) -> None:  # image: PIL.Image.Image
     if image.format == "TIFF" and 0 in image.tag_v2.get(_EXTRA_SAMPLES, ()) and "A" not in image.mode.upper():
         with log.each_once(_SAID):
             log.warn(
-                f"{path.parent}: a further channel of its TIFFs, of which they don't say that it is alpha (ExtraSamples 0), is not "
-                "read; where it is, export PNG"
+                f"{path.parent}: a further channel of its TIFFs is not declared as alpha (ExtraSamples 0) and is not read; if it is "
+                "alpha, export PNG"
             )
 
 

@@ -294,7 +294,7 @@ def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
     if why:
         with log.each_once(_SAID):
             log.warn(
-                f"{folder}: {why} can't be told from the names; the numbers order them as they stand. Names such as"
+                f"{folder}: {why} can't be told from the names; they are ordered by these numbers as written. Names such as"
                 " 2024-03-05_14-30-00 tell it"
             )
 

@@ -108,7 +108,9 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
             raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
         rate = float((stream.codec_context.framerate if bare else stream.average_rate) or 0)
         if bare and rate == _ASSUMED_RATE:
-            log.info(f"{path}: a stream without a container: {rate:g} frames per second, if it tells no other (--fps)")
+            log.info(
+                f"{path}: a stream without a container: {rate:g} frames per second, unless the stream states another rate (--fps)"
+            )
         if container.format.name == "avi" and stream.frames > len(stamps) + 1:
             rate = 0.0  # frames are repeated: their own time stamps tell when, or nothing does
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
@@ -132,7 +134,7 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
 
 
 def _ends_of_alpha(frame) -> tuple[int, int]:  # av.VideoFrame
-    """Returns the least and the greatest alpha: some writers fill a channel that nobody asked for, with 255 or with 0."""
+    """Returns the least and the greatest alpha: some writers add a needless channel, filled with 255 or 0."""
     alpha = _levels(frame, frame.width, {})[..., 3]
     return int(alpha.min()), int(alpha.max())
 
@@ -241,7 +243,7 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
     if left := empty_frames(path, stream.index):
         log.warn(f"{path}: {left} frames have no bytes: the program that recorded it left them out, as they are here")
     if cut:
-        log.warn(f"{path}: the file ends before its container does; frames behind the {held} that it holds may be lost")
+        log.warn(f"{path}: the file ends before its container does; frames after the {held} that it holds may be lost")
 
 
 def _declared_and_held(
@@ -332,7 +334,7 @@ def _require_one_layer(path: Path, stream) -> None:
         packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
         if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
             raise DataError(
-                f"{path}: its alpha lies in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
+                f"{path}: its alpha is in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
                 "ffmpeg -view_ids -1 -i IN -c:v prores_ks -pix_fmt yuva444p10le OUT.mov"
             )
 

@@ -28,7 +28,7 @@ class Workers:
 class Spread:
     """Says who works on which items; the bytes of the whole result depend on none of it.
 
-    jobs: processes, None for as many as pay. shard: only its items, None for all. dask: the address of a cluster's
+    jobs: processes, None for as many as are worthwhile. shard: only its items, None for all. dask: the address of a cluster's
     scheduler, `local` for a cluster on this machine, "" for processes.
     """
 
@@ -38,7 +38,7 @@ class Spread:
 
     @contextmanager
     def workers(self, jobs: int = 1) -> Iterator[Workers]:
-        """Yields the workers; `jobs` is how many processes pay where the user named no number.
+        """Yields the workers; `jobs`: how many processes are worthwhile, where the user gave no number.
 
         Raises UsageError and DpcError as `cluster_executor`.
         """

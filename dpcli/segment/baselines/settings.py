@@ -36,21 +36,21 @@ class ClassicalSettings:
         " frame; --model or --fast choose it too), or a classical method.",
     )
     parts: int | None = setting(
-        None, "Number of parts that a classical --method cuts each frame into; none: it finds one.", least=1
+        None, "Number of parts into which a classical --method divides each frame; none: found from the data.", least=1
     )
     motion: Literal["auto", "none", "flow", "residual"] = setting(
         "auto",
-        "What stands beside the coordinates: nothing, the flow, or the residual, which is the flow less the dominant"
+        "What is used besides the coordinates: nothing, the flow, or the residual, which is the flow minus the dominant"
         " rigid motion of the frame; auto: none for dbscan and ward, flow for ssc, residual for trajaffn.",
     )
     max_parts: int = setting(8, "Most parts where a classical --method finds their number.", least=1)
     smallest_cluster: float = setting(
         0.02, "Parts of a smaller share of a frame's points join their neighbor (--method).", least=0
     )
-    max_points: int = setting(1024, "Frames of more points are cut in a sample of so many (--method).", least=2)
+    max_points: int = setting(1024, "Frames of more points are divided on a sample of this size (--method).", least=2)
     eps: float = setting(0.1, "dbscan: distance within which points are neighbors, in diameters.", above=0)
     min_points: int = setting(5, "dbscan: neighbors that make a point a core point.", least=1)
-    motion_weight: float = setting(1.0, "dbscan, ward: how much motion counts against space.", least=0)
+    motion_weight: float = setting(1.0, "dbscan, ward: weight of motion relative to space.", least=0)
     threshold: float = setting(
         0.2, "ward: merges stop at this distance over the root of the number of points, in diameters.", above=0
     )

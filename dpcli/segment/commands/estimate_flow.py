@@ -19,7 +19,6 @@ from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.flow.estimators import METHODS, estimate_flow, find_estimator
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
-from dpcli.store.sequence import POINT_FIELDS
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -68,11 +67,10 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
         start + (np.sort(rng.choice(count, points, replace=False)) if 0 < points < count else np.arange(count))
         for start, count in zip(starts, counts)
     ]
-    rows = np.concatenate(keep).astype(np.int64)
-    taken = {name: getattr(sequence, name)[rows] for name in POINT_FIELDS if getattr(sequence, name) is not None}
+    drawn = replace(sequence)
     offsets = np.concatenate([[0], np.cumsum([len(own) for own in keep])]).astype(np.int64)
-    extra = {name: values[rows] for name, values in sequence.extra.items()}
-    return replace(sequence, points=sequence.points[rows], frame_offsets=offsets, extra=extra, **taken)
+    drawn.take_points(np.concatenate(keep).astype(np.int64), offsets)
+    return drawn
 
 
 def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:
@@ -170,7 +168,7 @@ def estimate_flow_of_file(
 
 
 def _worthwhile_processes(work: FlowOfSequence, frames: int) -> int:
-    """Returns how many processes pay: one for each core where rigid bodies are found, which takes one core, else one."""
+    """Returns how many processes are worthwhile: one for each core for the search of rigid bodies, which uses one core, else one."""
     return cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1
 
 

@@ -13,7 +13,6 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.segment.commands.settings_file import write_settings
 from dpcli.segment.flow.config import CATALOG, FlowConfig, FlowSchedule
 from dpcli.segment.flow.trainer import COLUMNS, FlowTrainer
 from dpcli.store import CloudsReader, input_file
@@ -44,7 +43,7 @@ def train_flow_estimator(
         with stop_requested() as stop:
             trainer = FlowTrainer(reader, folder, network, schedule, seed=seed, device=chosen, stop=stop)
             with folder:  # last: it may delete an earlier model
-                write_settings(folder, CATALOG.to_toml({"network": network, "schedule": schedule}, "segment flow"))
+                folder.write_settings(CATALOG.to_toml({"network": network, "schedule": schedule}, "segment flow"))
                 trainer.run()
     return folder.file("best.safetensors")
 

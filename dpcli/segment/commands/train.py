@@ -18,7 +18,6 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.segment.commands.settings_file import write_settings
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.frame_pairs import MOTION_FIELDS, PairSource
 from dpcli.segment.network.config import PartConfig
@@ -71,7 +70,7 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
         keep_freed_memory()
         estimate = None if supervised else partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow))
         with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
-            write_settings(folder, CATALOG.to_toml(settings._asdict(), "segment train"))
+            folder.write_settings(CATALOG.to_toml(settings._asdict(), "segment train"))
             Trainer(model, folder, settings, training, validation, estimate, notes, stop, seed).run()
     return folder.file("best.safetensors")
 

@@ -28,7 +28,7 @@ class FlowConfig:
     )
     hidden: int = setting(64, "Width of the gated recurrent unit.", least=1, most=WIDEST)
     head: int = setting(48, "Width of the layers that regress the flow.", least=1, most=WIDEST)
-    neighbors: int = setting(16, "Neighbors that a set convolution looks at.", least=1, most=2048)
+    neighbors: int = setting(16, "Neighbors in a set convolution.", least=1, most=2048)
     correlated: int = setting(
         8, "Nearest points of the other frame that a warped point is compared with.", least=1, most=2048
     )
@@ -37,7 +37,7 @@ class FlowConfig:
     )
     iterations: int = setting(4, "Estimates of the flow: the global match, then corrections.", least=1, most=1000)
     norm: Literal["layer", "batch"] = setting("layer", "Normalization of the layers.")
-    support: float = setting(10.0, "Distance beyond which the global match looks for nothing, in diameters.", above=0)
+    support: float = setting(10.0, "Largest distance of the global match, in diameters.", above=0)
 
     def __post_init__(self) -> None:
         check(self)

@@ -63,7 +63,7 @@ def find_bodies(source: np.ndarray, target: np.ndarray, search: BodySearch | Non
 
 
 def find_surface_bodies(source: Surface, target: Surface, search: BodySearch) -> Bodies:
-    """Returns what `find_bodies` does, of clouds that are prepared: whoever compares one with many prepares it once."""
+    """Returns what `find_bodies` does, of prepared clouds, so that a cloud compared with many is prepared once."""
     return _BodyFinder(source, target, search).run()
 
 

@@ -17,7 +17,7 @@ def soft_match_kernel(moved, target, bias, temperature, out, first, last):
     """Computes out (B,N,3): the mean of target (B,3,M) weighted by softmax(bias - |moved - target| / temperature).
 
     float32; moved (B,N,3), bias (B,N,M); rows first..last of the B * N. A row of `bias` holds at least one finite
-    number. target may have further columns, up to a multiple of 8: finite numbers that nobody reads.
+    number. target may have further columns, up to a multiple of 8: finite numbers that are not read.
     """
     rows, count = np.uintp(moved.shape[1]), np.uintp(bias.shape[2])
     width, end = np.uintp(WIDTH), np.uintp(target.shape[2])

@@ -22,6 +22,7 @@ from dpcli.segment.flow.model_file import augment_pair, save_flow_model
 from dpcli.segment.frame_pairs import PairSource
 from dpcli.store import CloudsReader
 
+_JUDGED = 64  # held-out pairs
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
 
 
@@ -133,13 +134,13 @@ class FlowTrainer:
         self._save()
 
     @torch.inference_mode()
-    def _validate(self, most: int = 64) -> tuple[float | None, float | None]:
+    def _validate(self) -> tuple[float | None, float | None]:
         """Returns loss and mean end point error (diameters) of at most 64 held-out pairs, forth only; None where unknown."""
         if self.held is None:
             return None, None
         self.model.eval()
         losses, errors = [], []
-        spread = np.linspace(0, len(self.held.pairs) - 1, min(most, len(self.held.pairs))).astype(int)
+        spread = np.linspace(0, len(self.held.pairs) - 1, min(_JUDGED, len(self.held.pairs))).astype(int)
         for number in spread:
             pair = self.held.load(self.held.pairs[number])
             first, second = torch.from_numpy(pair.points).to(self.device).unbind()

@@ -14,7 +14,7 @@ class MultibodySettings:
     Costs are in units of one point whose residuals are all at their worst.
     """
 
-    most_bodies: int = setting(24, "multibody: most bodies of a sequence.", least=1)
+    most_bodies: int = setting(24, "multibody: bodies of a sequence at most.", least=1)
     body_price: float = setting(0.001, "multibody: cost of a further body, as a share of all points.", least=0)
     border: float = setting(0.3, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
     agreement: float = setting(
@@ -22,20 +22,22 @@ class MultibodySettings:
     )
     hinge: float = setting(
         0.7,
-        "multibody: share of both that a point is spared where its body and the other one take it to one place.",
+        "multibody: share of both costs that is waived where a point's body and the other one move it to the same place.",
         least=0,
         most=1,
     )
     displacement: float = setting(
-        0.05, "multibody: cost of a point per diameter that it lies from where the largest body would take it.", least=0
+        0.05,
+        "multibody: cost of a point per diameter of its distance from where the largest body would move it.",
+        least=0,
     )
     flexible: float = setting(
-        0.02, "multibody: how far points bend away from rigid motion where tracks are given, diameters.", above=0
+        0.02, "multibody: how far points deviate from rigid motion where tracks are given, diameters.", above=0
     )
     regrow: int = setting(
         2,
-        "multibody: rounds in which each body in turn is taken out and its points are explained anew; then as many "
-        "with bodies split.",
+        "multibody: rounds in which each body in turn is removed and its points are explained again; then as many in which "
+        "bodies are split.",
         least=0,
     )
 

@@ -30,9 +30,9 @@ class NetworkSettings:
     )
     group: Group = setting("icosahedral", "Rotation group; trivial turns equivariance off (an ablation).")
     pooling: Pooling = setting(
-        "point", "Who chooses the rotations of eq. 4.2: each point, or the whole cloud at once (global, an ablation)."
+        "point", "What chooses the rotations of eq. 4.2: each point, or the whole cloud at once (global, an ablation)."
     )
-    motion_head: bool = setting(True, "Have a motion head, which says each part's rotation between two frames.")
+    motion_head: bool = setting(True, "Have a motion head, which predicts each part's rotation between two frames.")
     slots: int = setting(8, "Most parts that a frame can be divided into.", least=2, most=1000)
     points: int = setting(512, "Points of each frame that the network sees.", least=32)
 

@@ -44,7 +44,7 @@ def find_rotation(rotations: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """
     distance = np.abs(wanted[..., None, :, :] - rotations).max((-1, -2))
     if distance.size and distance.min(-1).max() > _CLOSE:
-        raise ValueError("a rotation is no element of the group")
+        raise ValueError("a rotation is not an element of the group")
     return distance.argmin(-1)
 
 

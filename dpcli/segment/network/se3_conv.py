@@ -192,7 +192,7 @@ class SeparableConv(nn.Module):
 
 
 def _activate(features: Tensor) -> Tensor:
-    """Returns instance norm and leaky ReLU of features (B,P,G,C) that nobody needs afterwards.
+    """Returns instance norm and leaky ReLU of features (B,P,G,C) that are not needed afterwards.
 
     Without gradient, they are overwritten. Backends: a numba kernel on CPU in float32 for channels in sixteens where no
     gradient is wanted, else torch; equal up to rounding.

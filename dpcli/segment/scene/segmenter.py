@@ -71,13 +71,13 @@ class SceneSegmenter(Segmenter):
         """Warns of frames whose place is unknown, since they overlap with none before them, and of objects left out."""
         if dropped:
             log.warn(
-                f"{name}: {dropped} moving objects beyond the largest {self.settings.most_objects} are taken to stand;"
+                f"{name}: {dropped} moving objects besides the largest {self.settings.most_objects} are assumed to stand still;"
                 " --set most_objects= keeps more"
             )
         if apart:
             log.warn(
                 f"{name}: frame {', '.join(map(str, apart))}: too little in common with the frame before to tell how the"
-                " sensor moved; it is taken to move on as before, and nothing is compared across the gap"
+                " sensor moved; its motion is assumed to continue, and nothing is compared across the gap"
             )
 
 

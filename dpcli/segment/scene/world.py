@@ -20,7 +20,7 @@ _SPACING = 0.6  # distances between rows of beams at which a surface still count
 class Frame:
     """Holds a registered frame: points f64 (N,3) and the sensor's origin (3) in the world, z up, meters; height f64 (N).
 
-    origin: None where nobody knows where the sensor stood. raised_above: meters over the ground from which points are
+    origin: None where the sensor's position is unknown. raised_above: meters over the ground from which points are
     looked at. label: the object of each point from 1, i64 (N). doubt, free: what others say against its standing still.
     """
 
@@ -58,11 +58,11 @@ class Frame:
 
     @property
     def across(self) -> float:
-        """Returns the angle between rows of beams, radians; a usual one where nobody knows the sensor."""
+        """Returns the angle between rows of beams, radians; a typical one where the sensor is unknown."""
         return self.sight.across if self.sight is not None else _USUAL
 
     def reach(self, points: np.ndarray) -> np.ndarray:
-        """Returns the distance (M) of points from the sensor, or from the frame's middle where nobody knows the sensor."""
+        """Returns the distance (M) of points from the sensor, or from the frame's middle where the sensor is unknown."""
         middle = self.points.mean(0) if self.origin is None else self.origin
         return np.linalg.norm(points - middle, axis=1)
 

@@ -50,22 +50,14 @@ class Outcome:
     flow: Tensor | None = None
 
 
-def pair_loss(
-    model: PartNetwork, batch: Batch, objective: Objective, progress: float, training: bool = True
-) -> Outcome:
-    """Returns the loss of a batch with every term that is on at `progress`.
-
-    progress: the share (0 to 1) of the training that is over. training: where it is off, nothing is matched, corrected
-    or turned.
-    """
+def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float) -> Outcome:
+    """Returns the loss of a batch with every term that is on at `progress`, the share (0 to 1) of the training that is over."""
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
     mask = frames.mask
     rotation, translation = weighted_kabsch(batch.points, batch.points + batch.flow, mask.detach())
-    needs_match = (
-        model.motion is not None and training and progress >= min(objective.motion_after, objective.update_after)
-    )
+    needs_match = model.motion is not None and progress >= min(objective.motion_after, objective.update_after)
     order = _match(batch, mask) if needs_match else None
     beta = None
     terms: dict[str, Tensor] = {}
@@ -74,18 +66,18 @@ def pair_loss(
         terms["motion"] = objective.motion * _motion(model, batch, frames, matched, rotation)
         if objective.consensus != "none" and progress >= objective.consensus_after:
             beta = _consensus(model, batch, frames, order, objective)
-    if objective.cold_start and training and progress < objective.cold_until:
+    if objective.cold_start and progress < objective.cold_until:
         terms["cold_start"] = objective.cold_start * _cold_start(batch, mask)
     terms["dynamic"] = objective.dynamic * _rigidity(batch, mask, rotation, translation, beta, objective)
-    if progress >= objective.smooth_after or not training:
+    if progress >= objective.smooth_after:
         terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbors(batch.points))
-    if objective.invariance and training:
+    if objective.invariance:
         terms["invariance"] = objective.invariance * invariance_loss(mask, model(turn_randomly(batch.points)[0]).mask)
     loss = torch.stack(list(terms.values())).sum()
     values = {name: float(term.detach()) for name, term in terms.items()}
     if beta is not None:
         values["consensus"] = float((beta * mask.detach()).sum(-1).mean())
-    update = training and objective.flow_decay < 1 and progress >= objective.update_after
+    update = objective.flow_decay < 1 and progress >= objective.update_after
     return Outcome(loss, values, _corrected(batch, mask.detach(), order, objective) if update else None)
 
 

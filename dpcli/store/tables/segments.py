@@ -153,7 +153,7 @@ def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
         raise DataError(f"{where}: recording {name!r}, class {title!r}; expected a name, and a class that may be empty")
     if end <= start:
         raise DataError(
-            f"{where}: ends at {end}, which is not behind its start {start}; `end` is one past the last frame"
+            f"{where}: ends at {end}, which is not after its start {start}; `end` is one past the last frame"
         )
     try:
         confidence = float(row.get("confidence") or "nan")

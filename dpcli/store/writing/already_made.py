@@ -43,7 +43,7 @@ def already_made(
     try:
         history = reader(target).provenance
     except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
+        raise UsageError(f"{error}\nIt is where the output should go: write to another file, or use --force") from None
     before = history[-1] if history else {}
     if not history or any(before.get(key) != entry.get(key) for key in keys):
         made = _describe_differences(before, entry) if history else "by another program"

@@ -36,7 +36,7 @@ class AtomicFile:
     it at the end of the block, or discards it when the block fails.
     """
 
-    def __init__(self, target: str | Path, mode: str = "w", suffix: str = ".part") -> None:
+    def __init__(self, target: str | Path, suffix: str = ".part") -> None:
         self.target, self.needed = Path(target), 0
         self.part = self.target.with_name(f".{self.target.name}{suffix}")
         if not self.target.parent.is_dir():
@@ -45,7 +45,7 @@ class AtomicFile:
             raise DataError(f"{self.target}: is a folder; name a file in it")
         check_regular(self.target)
         try:
-            self.file = _HeldOpen(self.part, mode)
+            self.file = _HeldOpen(self.part, "w")
             self.handle, self._written_out = self.file.id.get_vfd_handle(), 0
         except OSError as error:
             busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()

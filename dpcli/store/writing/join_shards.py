@@ -106,7 +106,7 @@ def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, res
 def _read_piece(reader: Reader) -> _Piece:
     if not is_shard(reader):
         raise UsageError(
-            f"{reader.path}: is no shard (--shard i/n); only the shards of one run are joined, and clouds of any origin"
+            f"{reader.path}: is not a shard (--shard i/n); only the shards of one run can be merged, or clouds of any origin"
         )
     shard, entry = shard_of(reader.provenance[-1])  # type: ignore[misc]
     written, skipped = reader.positions or ([], [])

@@ -16,7 +16,7 @@ from typing import Any
 from dpcli.config_diff import differences
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.runtime.whole_file import DiskFull, disk_full, not_writable, refuse_existing
-from dpcli.store.file import write_positions, write_root, write_skipped
+from dpcli.store.file import history_of, write_positions, write_root, write_skipped
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.store.writing.journal import Journal, Placed, data_suffix, journal_path, second_path
 
@@ -49,20 +49,20 @@ class ResumableWriter(ABC):
         self,
         path: str | Path,
         *,
-        class_names: Sequence[str],
-        length_unit: str,
-        source: str,
-        seed: int,
-        provenance: dict | Sequence[dict] | None,
-        force: bool,
-        resume: bool,
+        class_names: Sequence[str] = (),
+        length_unit: str = "",
+        source: str = "",
+        seed: int = 0,
+        provenance: dict | Sequence[dict] | None = None,
+        force: bool = False,
+        resume: bool = False,
     ) -> None:
         refuse_existing(path, force)
         self.path, self.resume, self.keep = Path(path), resume, False
         self.skipped: list[tuple[str, str]] = []
         self.positions: tuple[Sequence[int], Sequence[int]] | None = None
         self.class_names, self._root = list(class_names), {"length_unit": length_unit, "source": source, "seed": seed}
-        self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
+        self.provenance = history_of(provenance)
         self.written_names: list[str] = []
         self._journal: Journal | None = None
         self._recorded, self.expected = 0, 0
@@ -123,7 +123,7 @@ class ResumableWriter(ABC):
         some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
         said = "; ".join(some) or "an earlier step of its files differs"
         return UsageError(
-            f"{self.path}: what a stopped run kept for it is of other work ({said}); run that command again to go on with it,"
+            f"{self.path}: a stopped run with other settings or inputs ({said}) left its work here; run that command again to continue it,"
             " write to another file, or --force to start over"
         )
 
@@ -184,7 +184,7 @@ class ResumableWriter(ABC):
         return f"the {self._recorded} samples done are kept" if self._journal and self._recorded else ""
 
     def _needed(self) -> int:
-        """Returns about how many bytes all samples take, journal and all, by what those done take; 0 where nobody knows."""
+        """Returns about how many bytes all samples take, journal and all, estimated from those done; 0 where unknown."""
         files = [self._atomic.part, self._journal.path] if self._journal and self._recorded else []
         return sum(one.stat().st_size for one in files if one.exists()) * self.expected // max(self._recorded, 1)
 

@@ -103,7 +103,7 @@ def streamed_and_cut(tmp_path, data, capsys):
     assert "another" not in capsys.readouterr().err
     assert dpc("classify", "predict", tmp_path / "millimeters.npy", *window, *model) == 0
     said = capsys.readouterr().err
-    assert "millimeters.npy: half of the points lie within" in said and "another unit of length?" in said
+    assert "millimeters.npy: half of the points lie within" in said and "is the unit of length another one?" in said
     assert dpc("classify", "predict", tmp_path / "bare.npy", *window, *model) == 3
     assert "frame 0: 3 numbers a point; the model reads 4: x, y, z, speed, in this order" in capsys.readouterr().err
     cut = tmp_path / "cut.csv"
@@ -158,5 +158,5 @@ def test_a_stream_of_places_alone_is_predicted_by_its_window(tmp_path):
     assert np.allclose(nothing[-1].scores, 0.5)  # no point tells no class
     assert [one is not None for one in made] == [t >= 5 for t in range(video.num_frames)]
     assert all(np.allclose(one.scores.sum(-1), 1, atol=1e-5) for one in made if one is not None)
-    with pytest.raises(UsageError, match="a stream has no whole"):
+    with pytest.raises(UsageError, match="a stream has no end"):
         StreamPredictor(Kinet(config).eval(), info)

@@ -27,7 +27,9 @@ def told(capsys, frames, model="msraction3d-24", **changes):
 
 def test_a_shipped_network_tells_another_unit_and_few_points(capsys):
     assert told(capsys, body()) == "" == told(capsys, body(2.5)) and told(capsys, []) == ""
-    assert "another unit of length?" in told(capsys, body(1000)) and "within 0.233" in told(capsys, body(0.001))
+    assert "is the unit of length another one?" in told(capsys, body(1000)) and "within 0.233" in told(
+        capsys, body(0.001)
+    )
     assert "a frame has 20 points in the median, msraction3d-24 takes 2048: repeated" in told(capsys, body(points=20))
 
 
@@ -37,7 +39,7 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     notes = {"notes": {NOTE: like(body(points=5))}, "timing": "slots"}
     assert told(capsys, body(points=9), own, **notes) == ""
     assert "a frame has 300 points in the median, 5 in what" in told(capsys, body(), own, **notes)
-    assert "another unit" in told(capsys, body(1000, points=5), own, **notes)
+    assert "length another one" in told(capsys, body(1000, points=5), own, **notes)
     for odd in ({}, {"extent": "long", "points": None}, [1]):
         assert told(capsys, body(1000, points=5), own, notes={NOTE: odd}, timing="slots") == ""  # nothing is known
 

@@ -170,7 +170,7 @@ def test_rows_of_the_last_layers_go_by_the_names_of_the_classes(preset, names, c
 
 
 def test_what_can_not_be_tuned_is_refused(tmp_path, model):
-    with pytest.raises(UsageError, match="--fine-tune head: goes on from a model; name it with --init"):
+    with pytest.raises(UsageError, match="--fine-tune head: needs a model to start from; name it with --init"):
         training_settings(Given("quick", flags={"fine_tune": "head"}))
     explicit = Given("tiny", sets=SMALL | {"epochs_dynamic": 0}, flags={"init": "x", "fine_tune": "auto"})
     assert training_settings(explicit).schedule.fine_tune == "auto"

@@ -284,7 +284,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
         assert torch.equal(ours[0].state_dict()[key], value), key
     within = override(SHORT, ("--epochs", "0", "--set", "epochs_dynamic=0", "--set", "static_temporal_radius=0"))
     assert dpc("classify", "train", data, "-o", tmp_path / "within", *within, "--init", alone) == 0
-    assert "--set static_temporal_radius=1 goes on as it was" in capfd.readouterr().err
+    assert "--set static_temporal_radius=1 keeps that" in capfd.readouterr().err
     assert (
         dpc("classify", "train", data, "-o", tmp_path / "q", "--preset", "quick", "--frames", 4, "--init", alone) == 2
     )

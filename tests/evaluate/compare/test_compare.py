@@ -14,8 +14,8 @@ from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.classification.protocol import evaluate_classification
-from dpcli.evaluate.compare.file_metrics import metrics_of_values
-from dpcli.evaluate.compare.paired import compare_metrics, pair_metrics
+from dpcli.evaluate.compare.file_metrics import EvaluationOptions, metrics_of_values
+from dpcli.evaluate.compare.paired import CompareReport, pair_metrics
 from dpcli.evaluate.compare.paired_picture import draw_comparison
 from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
 from dpcli.evaluate.compare.result_json import compare_json
@@ -135,7 +135,8 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
         metrics_of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
         for n, table in zip("ab", tables, strict=True)
     ]
-    report = compare_metrics(*sides, Resampling(200))
+    part = pair_metrics(*sides, Resampling(200))
+    report = CompareReport(("a.h5", "b.h5"), EvaluationOptions(), Resampling(200), [part], ([], []))
     found = json.loads(json.dumps(compare_json(report), allow_nan=False))
     assert found["metrics"]["psnr"]["interval"] == pytest.approx([-1, -1])
     assert (found["metrics"]["psnr"]["b_better"], found["metrics"]["lpips"]["a_better"]) == (4, 4)

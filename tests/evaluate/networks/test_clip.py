@@ -1,4 +1,4 @@
-"""CLIP: preprocessing and embeddings against transformers on a tiny network, and the four similarities by hand."""
+"""CLIP: preprocessing and embeddings against transformers on a tiny network, and similarities by hand."""
 
 from __future__ import annotations
 
@@ -14,18 +14,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.networks import weights as module
-from dpcli.evaluate.networks.clip import (
-    DEVIATION,
-    MEAN,
-    Clip,
-    clip_across_views,
-    clip_similarity,
-    clip_spherical,
-    clip_temporal,
-    cosines,
-    preprocess,
-    spherical,
-)
+from dpcli.evaluate.networks.clip import DEVIATION, MEAN, Clip, cosines, preprocess, spherical
 from dpcli.evaluate.networks.weights import Weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -193,23 +182,8 @@ def test_without_transformers(tiny_folder, monkeypatch):
 def test_by_hand():
     x, y = np.array([[1.0, 0], [0, 2]]), np.array([[1.0, 1], [0, 3]])
     assert np.allclose(cosines(x, y), [np.sqrt(0.5), 1])
-    assert clip_similarity(x, y) == pytest.approx((np.sqrt(0.5) + 1) / 2)
     assert np.allclose(spherical(x, y), [(np.pi / 4) ** 2 / 2, 0])  # half the squared angle
-    assert clip_spherical(x, y) == pytest.approx((np.pi / 4) ** 2 / 4)
     assert spherical(x[:1], -x[:1]) == pytest.approx(np.pi**2 / 2)
-    assert clip_temporal(np.array([[1.0, 0], [1, 1], [0, 1]])) == pytest.approx(np.sqrt(0.5))
-
-
-def test_across_views_is_the_mean_of_pairs():
-    rng = np.random.default_rng(4)
-    e = rng.normal(size=(4, 3, 5))
-    e /= np.linalg.norm(e, axis=-1, keepdims=True)
-    pairs = [e[v, t] @ e[w, t] for t in range(3) for v in range(4) for w in range(v)]
-    assert len(pairs) == 18 and clip_across_views(e) == pytest.approx(np.mean(pairs), abs=1e-12)
-    assert clip_across_views(e[rng.permutation(4)][:, rng.permutation(3)]) == pytest.approx(np.mean(pairs), abs=1e-12)
-    moved = e.copy()
-    moved[1] = np.roll(moved[1], 1, 0)  # one view late: another value, so time is what is matched
-    assert abs(clip_across_views(moved) - np.mean(pairs)) > 1e-3
 
 
 @settings(max_examples=50, deadline=None)
@@ -221,17 +195,12 @@ def test_the_angle_is_what_counts(seed, width, scale):
     assert np.allclose(spherical(x, y), angle**2 / 2, atol=1e-6)
     assert np.allclose(cosines(x * scale, y), cosines(x, y)) and np.allclose(cosines(x, x), 1)
     turn = np.linalg.qr(rng.normal(size=(width, width)))[0]
-    assert clip_temporal(x @ turn) == pytest.approx(clip_temporal(x), abs=1e-9)
+    assert np.allclose(cosines(x @ turn, y @ turn), cosines(x, y))
 
 
 def test_too_little_or_nothing():
     one = np.ones((1, 4))
     for call, words in (
-        (lambda: clip_similarity(one[:0], one[:0]), "no frames"),
-        (lambda: clip_spherical(one[:0], one[:0]), "no frames"),
-        (lambda: clip_temporal(one), "two frames or more"),
-        (lambda: clip_across_views(one[None]), "two views or more"),
-        (lambda: clip_across_views(np.ones((2, 0, 4))), "two views or more"),
         (lambda: cosines(one, 0 * one), "an embedding is zero"),
         (lambda: spherical(one, np.nan * one), "an embedding is zero, NaN"),
     ):

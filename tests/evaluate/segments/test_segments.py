@@ -118,7 +118,7 @@ def test_the_command_compares_tables_in_any_form_and_order(tmp_path):
     "rows, told",
     [
         ("a,0,10,wave\na,5,20,bow\n", "overlap"),
-        ("a,10,10,wave\n", "not behind its start"),
+        ("a,10,10,wave\n", "not after its start"),
         ("a,-1,10,wave\n", "line 2: start '-1'"),
         ("a,0,1e99,wave\n", "end '1e99'"),
         ("a,0.5,3,wave\n", "a frame's number"),

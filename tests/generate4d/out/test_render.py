@@ -215,11 +215,11 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
         np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
         assert reader.provenance[-1]["config"] == {"cameras": True, "color": "part", "trajectories": True}
     for more, says in (
-        (["--background", "black"], "background: not with --cameras"),
-        (["--path", "swing"], "path: not with"),
-        (["--set", "frames=3", "--set", "fps=9"], "frames, fps: not with"),
+        (["--background", "black"], "background: cannot be used with --cameras"),
+        (["--path", "swing"], "path: cannot be used with"),
+        (["--set", "frames=3", "--set", "fps=9"], "frames, fps: cannot be used with"),
         (["--azimuth", "0", "--time", "0"], "azimuth, time:"),
-        (["--size", "32"], "size: not with"),
+        (["--size", "32"], "size: cannot be used with"),
     ):
         refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)

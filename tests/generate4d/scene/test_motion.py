@@ -68,13 +68,12 @@ def test_nothing_moves_before_the_first_step():
 def test_the_blend_is_equation_5_6_with_the_displacement():
     """One point after the other, by hand; and eq. 5.6 as printed (a position in place of a displacement) is not that."""
     field, points = _field(), torch.randn(5, 3)
-    motion, matrix = field(points, TIMES), field(points, TIMES).part_matrix()
+    motion = field(points, TIMES)
+    turn, shift = quaternion_to_matrix(motion.part_quaternion), motion.part_translation
     alone = _field(rigid=False)(points, TIMES).displacement
     for b in range(3):
         for n in range(5):
-            moved = sum(
-                motion.part[b, n, s] * (matrix[b, s, :3, :3] @ points[n] + matrix[b, s, :3, 3]) for s in range(3)
-            )
+            moved = sum(motion.part[b, n, s] * (turn[b, s] @ points[n] + shift[b, s]) for s in range(3))
             w = motion.weight[b, n]
             torch.testing.assert_close(motion.displacement[b, n], w * (moved - points[n]) + (1 - w) * alone[b, n])
             assert not torch.allclose(motion.displacement[b, n], w * moved + (1 - w) * alone[b, n], atol=1e-3)
@@ -83,7 +82,7 @@ def test_the_blend_is_equation_5_6_with_the_displacement():
 def test_without_fusion_the_two_are_added_and_without_rigid_only_the_rest_is_left():
     points = torch.randn(6, 3)
     added, alone = _field(fusion=False)(points, TIMES), _field(rigid=False)(points, TIMES)
-    moved = torch.einsum("bns,bsij,nj->bni", added.part, added.part_matrix()[..., :3, :3], points)
+    moved = torch.einsum("bns,bsij,nj->bni", added.part, quaternion_to_matrix(added.part_quaternion), points)
     moved = moved + added.part @ added.part_translation
     torch.testing.assert_close(added.displacement, moved - points + alone.displacement)
     assert (alone.weight == 0).all() and (added.weight == 1).all()

@@ -272,7 +272,7 @@ def test_labels_from_folders(tmp_path):
     assert found == [("a clap/deep/1.npy", 0, ""), ("wave/2.npy", 1, ""), ("wave/10.npy", 1, "")]
     assert reader.read(reader.items()[1], np.random.default_rng(0)).sequence.label == 1
     with pytest.raises(
-        DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"
+        DataError, match=r"'2.npy' is in no folder of its class; --label-from-folder expects CLASS/VIDEO"
     ):
         DepthVideos(inputs=(tmp_path / "own" / "wave",), label_from_folder=True).items()
     with pytest.raises(UsageError, match="use one"):

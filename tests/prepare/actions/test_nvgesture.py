@@ -156,7 +156,7 @@ def test_names_splits_subjects_and_labels(tmp_path):
         (line(label=26, start=3), r"_v2.lst:2: label 26 is out of range"),
         ("garbage", r"_v2.lst:2: expected 'path:"),
         (line(), r"_v2.lst:2: class_01/subject3_r0@2 is listed twice"),
-        (line("../../secret", start=3), r"_v2.lst:2: .*secret.* lies outside the folder"),
+        (line("../../secret", start=3), r"_v2.lst:2: .*secret.* is outside the folder"),
     ],
 )
 def test_a_bad_line_is_one_bad_item_that_names_list_and_line(tmp_path, text, message):

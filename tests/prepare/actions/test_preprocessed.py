@@ -243,7 +243,7 @@ def test_options_that_do_not_fit(tmp_path):
     np.savez(tmp_path / "n" / f"{MSR}.npz", point_clouds=np.ones((1, 4, 3)))
     for call, message in (
         (lambda: open_preprocessed(tmp_path / "p", scale=2.0), "--scale: pts_label.npy holds pixels"),
-        (lambda: open_preprocessed(tmp_path / "n", lists=tmp_path), "--lists: the names of msraction3d's files tell"),
+        (lambda: open_preprocessed(tmp_path / "n", lists=tmp_path), "--lists: the names of msraction3d's files give"),
         (lambda: open_preprocessed(tmp_path, form="kitti"), "--form kitti: expected one of auto"),
         (lambda: open_preprocessed(tmp_path / "n", protocol="x"), "--protocol x: expected xsub or xview"),
         (lambda: open_preprocessed(tmp_path / "n", scale=-1.0), "--scale -1: expected stored units"),

@@ -216,7 +216,7 @@ def test_too_bulky_objects_shrink_and_then_fail():
 
 
 class _Still:
-    """A generator that always proposes the same, so objects collide for ever."""
+    """A generator that always proposes the same, so objects collide forever."""
 
     def uniform(self, low, high, size=None):
         return np.broadcast_to(np.asarray(low, float), size if size is not None else np.shape(low)).copy()

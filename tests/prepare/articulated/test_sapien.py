@@ -256,7 +256,7 @@ def test_layouts(tmp_path):
     (linked / "3").symlink_to(linked / "1")
     assert [i.name for i in Sapien(linked, 1, allow_outside=True).items()] == ["1_000", "3_000", "Safe_2_000"]
     (problem,) = [i.problem for i in Sapien(linked, 1).items() if i.problem]
-    assert "linked/2/mobility.urdf: 'mobility.urdf' lies outside the folder" in problem
+    assert "linked/2/mobility.urdf: 'mobility.urdf' is outside the folder" in problem
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="no URDF found; expected a .urdf file, or a folder of objects"):
         find_objects(tmp_path / "empty")
@@ -484,7 +484,7 @@ def test_names_of_ros_packages_and_of_browsers(tmp_path):
     shape = '<mesh filename="package://my_robot/meshes/a%20cube.obj"/>'
     elements = [link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b")]
     path = write_urdf(pack / "urdf" / "r.urdf", *elements)
-    for raw, problem in ((pack, ""), (path, "lies outside the folder .*/urdf: name a folder above it")):
+    for raw, problem in ((pack, ""), (path, "is outside the folder .*/urdf: name a folder above it")):
         assert re.search(problem, Sapien(raw).items()[0].problem) and bool(Sapien(raw).items()[0].problem) == bool(
             problem
         )
@@ -522,7 +522,7 @@ def test_an_origin_by_a_quaternion_turns_as_one_by_angles(tmp_path):
     x, y, z, w = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_quat()
     found = placed(f'xyz="1 2 3" quat_xyzw="{x} {y} {z} {w}"')
     np.testing.assert_allclose(found, placed('xyz="1 2 3" rpy="0.3 -0.7 1.1"'), atol=1e-9)
-    with pytest.raises(DataError, match="quat_xyzw '0 0 0 0' is no rotation"):
+    with pytest.raises(DataError, match="quat_xyzw '0 0 0 0' is not a rotation"):
         placed('quat_xyzw="0 0 0 0"')
 
 
@@ -579,7 +579,7 @@ def test_nothing_outside_the_folder_is_opened(name, tmp_path):
     shape = f'<mesh filename="{name.format(outside=outside)}"/>'.replace("\1", "x" * 300)
     write_urdf(raw / "mobility.urdf", link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b"))
     problem = Sapien(tmp_path / "raw").items()[0].problem
-    assert "1/mobility.urdf: its mesh" in problem and ("lies outside" in problem or "cannot be a file's" in problem)
+    assert "1/mobility.urdf: its mesh" in problem and ("is outside" in problem or "cannot be a file's" in problem)
     if "x" * 9 not in shape:
         assert not Sapien(tmp_path / "raw", allow_outside=True).items()[0].problem
 
@@ -594,7 +594,7 @@ def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
     write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
     assert not Sapien(tmp_path).items()[0].problem
     assert not Sapien(tmp_path / "robot").items()[0].problem
-    assert "'../meshes/c.obj' lies outside" in Sapien(tmp_path / "robot" / "urdf").items()[0].problem
+    assert "'../meshes/c.obj' is outside" in Sapien(tmp_path / "robot" / "urdf").items()[0].problem
     (tmp_path / "named.urdf").symlink_to(two(tmp_path))
     assert not Sapien(tmp_path / "named.urdf").items()[0].problem
 

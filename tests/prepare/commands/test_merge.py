@@ -115,7 +115,7 @@ def test_a_label_map_joins_unlike_classes(two, tmp_path):
         ('[files."c.h5"]\n"g1" = "push"', "no file 'c.h5' among a.h5, b.h5"),
         ('[files."b.h5"]\n"push" = "g1"', "b.h5 has no class 'push'"),
         ('classes = ["g1"]\n', "class 'hand wave' becomes 'hand wave', which classes"),
-        ("[labels]\npush = 3\n", "something that is no name"),
+        ("[labels]\npush = 3\n", "something that is not a name"),
         ("labels = 3\n", "labels is 3, expected a table"),
         ("[label]\nx = 'y'\n", "holds label; expected classes"),
         ('classes = ["g1", "g1"]\n', "expected names, each once"),
@@ -263,7 +263,7 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
     again = write(tmp_path / "c.h5", ["c0", "c1"], ["hand wave", "push", "bend"])
     stopped_after(2, monkeypatch, [two[0], again], out)
     assert journal.exists()
-    with pytest.raises(UsageError, match='of other work .config.merge ."a.h5", "c.h5"., now'):
+    with pytest.raises(UsageError, match='with other settings or inputs .config.merge ."a.h5", "c.h5"., now'):
         merge([again, two[0]], out)
     assert journal.exists()
     merge([again, two[0]], out, force=True)

@@ -170,7 +170,7 @@ def test_impossible_choices(whole, tmp_path):
             SplitChoice(**options)
     with CloudsWriter(tmp_path / "plain.h5") as writer:
         writer.write(CloudSequence.from_frames("x", [np.zeros((1, 3), np.float32)]))
-    with pytest.raises(DataError, match="tells no splits"):
+    with pytest.raises(DataError, match="has no splits"):
         split(tmp_path / "plain.h5", tmp_path / "d", SplitChoice())
     with pytest.raises(DataError, match="subjects are not known"):
         split(tmp_path / "plain.h5", tmp_path / "d", SplitChoice(fractions=(1.0, 0.0, 0.0), by_subject=True))

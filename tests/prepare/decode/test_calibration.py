@@ -352,7 +352,7 @@ def test_numbers_that_no_camera_has_are_refused_or_not_used(tmp_path, name, cont
 
 def test_a_file_that_is_missing_or_no_text(tmp_path):
     (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00\x80")
-    for name, message in (("none.json", "cannot be read"), ("k.json", "is no text")):
+    for name, message in (("none.json", "cannot be read"), ("k.json", "is not text")):
         with pytest.raises(DataError, match=message):
             read_calibration(tmp_path / name)
 

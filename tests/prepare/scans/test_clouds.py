@@ -326,7 +326,7 @@ def test_the_way_of_a_camera_is_no_cloud(tmp_path, row):
 def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
     for folder in ("a", "wave/b"):
         save(tmp_path / folder / "0.npy")
-    with pytest.raises(DataError, match="'a' lies in no folder of its class"):
+    with pytest.raises(DataError, match="'a' is in no folder of its class"):
         CloudFolders(tmp_path, label_from_folder=True).items()
 
 

@@ -230,8 +230,8 @@ def test_folders_and_names(tmp_path):
 
 def test_wrong_options(tmp_path):
     for options, words in (
-        ({"objects": ("lorry",)}, "--objects lorry: lorry is no class"),
-        ({"objects": ()}, "nothing is no class"),
+        ({"objects": ("lorry",)}, "--objects lorry: lorry is not a class"),
+        ({"objects": ()}, "nothing is not a class"),
         ({"labels": "x"}, "expected instance or obj_map"),
         ({"far": 0.0}, "above 0"),
         ({"coordinates": "x"}, "expected published or camera"),

@@ -214,7 +214,7 @@ def test_tables_that_cannot_be_split(tmp_path):
     (item,) = TableSequences(write(tmp_path / "0.csv", [], "frame,x,y,z")).items()
     assert "a header, but no rows" in item.problem
     (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
-    assert "which column numbers the frames? --frame-column NAME says it; found x, y, z" in item.problem
+    assert "which column numbers the frames? give --frame-column NAME; found x, y, z" in item.problem
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
     assert "1 rows, the first is 1, have no number in 'frame'" in item.problem
     (item,) = TableSequences(write(tmp_path / "c.csv", [("p", 1, 2, 3)]), gap=2).items()

@@ -9,12 +9,13 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from dpcli.errors import UsageError
+from dpcli.prepare.articulated.articulated_object import axis_rotation
 from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, track_points
 from dpcli.prepare.synthetic import creature
 from dpcli.prepare.synthetic.animal import make_animal
 from dpcli.prepare.synthetic.creature import Shape
 from dpcli.prepare.synthetic.creature_mesh import make_skin, shape_distance, smooth_union
-from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, rotations, turn_bones
+from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, turn_bones
 from dpcli.prepare.synthetic.surface_nets import surface_nets
 from dpcli.runtime.seeds import generator
 from dpcli.store.views import ViewsReader
@@ -86,12 +87,12 @@ def test_weights_stay_within_one_limb():
 
 def test_rotations_about_an_axis():
     axis = np.array([1.0, 2, -2]) / 3
-    found = rotations(axis, np.array([0.0, 0.8]))
+    found = axis_rotation(axis, np.array([0.0, 0.8]))
     np.testing.assert_allclose(found[0], np.eye(3))
     np.testing.assert_allclose(found[1] @ axis, axis)
     np.testing.assert_allclose(found[1] @ found[1].T, np.eye(3), atol=1e-12)
     assert np.trace(found[1]) == pytest.approx(1 + 2 * np.cos(0.8)) and np.linalg.det(found[1]) == pytest.approx(1)
-    turned = rotations(np.array([0, 0, 1.0]), np.array([np.pi / 2]))[0] @ [1, 0, 0]
+    turned = axis_rotation(np.array([0, 0, 1.0]), np.array([np.pi / 2]))[0] @ [1, 0, 0]
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
 
 

@@ -866,7 +866,7 @@ def test_annotations_given_as_masks_and_cameras_beside_frames_are_told(tmp_path,
     assert exit_code(*words, "--mask", tmp_path / "labels") == 3
     assert "labels: 0.json: annotations and arrays are not read as masks; draw" in capfd.readouterr().err
     assert exit_code(*words) == 0
-    assert "clip: sparse: not read; the camera of a clip is taken to stand still" in capfd.readouterr().err
+    assert "clip: sparse: not read; the camera of a clip is assumed to stand still" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(("other", "pattern"), [("fox_{}.png", "anya_*.png"), ("preview.png", "")])
@@ -883,7 +883,7 @@ def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictu
     folder = save(tmp_path / "scene" / "images", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
     (folder / beside).write_text('<x:xmpmeta xcr:Position="1"/>' if beside == "0.xmp" else "<x:xmpmeta/>")
     open_frames(folder)
-    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is taken to stand still"
+    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is assumed to stand still"
     assert (said in capfd.readouterr().err) == (beside not in ("edits.xmp", "../../sparse"))
 
 

@@ -114,5 +114,5 @@ def test_pictures_behind_those_that_an_animation_counts_are_told(kind, tmp_path,
         data[4:8] = (at - 8).to_bytes(4, "little")
     path.write_bytes(data)
     assert len(animation_times(path)) == 3 and said == [
-        f"{path}: 2 pictures lie behind the 3 that its header counts, and are left out"
+        f"{path}: 2 pictures follow the 3 that its header counts, and are left out"
     ]

@@ -208,7 +208,7 @@ def test_frames_shown_for_less_than_browsers_can_stay_a_tenth_of_a_second(tmp_pa
 def test_pages_of_a_tiff_are_no_clip(tmp_path):
     images = [Image.new("RGB", (8, 8), (k, 0, 0)) for k in range(3)]
     images[0].save(tmp_path / "a.tif", save_all=True, append_images=images[1:])
-    with pytest.raises(DataError, match="3 pages, which tell no times; write each into a folder"):
+    with pytest.raises(DataError, match="3 pages without times; write each as an image into a folder"):
         open_frames(tmp_path / "a.tif")
 
 

@@ -80,7 +80,7 @@ def test_alpha_in_a_layer_of_hevc_is_refused_by_name(pictures, tmp_path):
     path = film(pictures, tmp_path / "sticker.mov", *words)
     ffmpeg("-i", path, "-c", "copy", tmp_path / "sticker.mkv")
     for name in ("sticker.mov", "sticker.mkv"):
-        with pytest.raises(DataError, match="its alpha lies in a layer of HEVC that is not decoded; FFmpeg 9"):
+        with pytest.raises(DataError, match="its alpha is in a layer of HEVC that is not decoded; FFmpeg 9"):
             look_at_video(tmp_path / name)
 
 

@@ -247,6 +247,6 @@ def test_mistakes_end_with_a_sentence(data, tmp_path):
     with pytest.raises(DataError, match="no sequence of split 'val'; it has"):
         estimate(data, tmp_path / "flow.h5", split="val")
     (tmp_path / "text.h5").write_text("no")
-    with pytest.raises(UsageError, match="stands where the output should go"):
+    with pytest.raises(UsageError, match="is where the output should go"):
         estimate(data, tmp_path / "text.h5")
     assert [p.name for p in tmp_path.iterdir()] == ["text.h5"]

@@ -45,7 +45,7 @@ def test_a_command_that_fails_deletes_no_network(dpc_here, data, run_folder, tmp
     for more, said in (
         (("--init", folder), "--init"),
         (("--init", "nosuch"), "--init nosuch: no such file"),
-        (("--set", f"flows_of={folder}"), "lies in the folder of -o"),
+        (("--set", f"flows_of={folder}"), "is in the folder of -o"),
         (("--set", f"flows_of={other}"), "no flows of a `dpc segment train` run"),
         (("--flow", "nosuch"), "--flow nosuch: expected icp"),
     ):

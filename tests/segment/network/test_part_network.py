@@ -61,7 +61,7 @@ def test_the_group_is_the_icosahedrons():
 
 
 def test_a_rotation_outside_the_group_is_no_element():
-    with pytest.raises(ValueError, match="no element"):
+    with pytest.raises(ValueError, match="not an element"):
         find_rotation(icosahedral_group().rotations, np.diag([-1.0, -1.0, 1.0])[[1, 0, 2]] * 1.0)
 
 

@@ -172,7 +172,7 @@ def test_frames_that_show_no_common_place_are_named(capsys):
 
 def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
     labels, said = explained(street(), most_objects=1)
-    assert "street: 1 moving objects beyond the largest 1" in capsys.readouterr().err
+    assert "street: 1 moving objects besides the largest 1" in capsys.readouterr().err
     assert said.probability.shape[1] == 2 and set(np.unique(np.concatenate(labels))) == {0, 1}
     ids, counts = np.unique(street().part[np.concatenate(labels) == 1], return_counts=True)
     assert ids[counts.argmax()] == 1  # the car, which has more points than the person

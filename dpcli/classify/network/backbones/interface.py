@@ -94,7 +94,7 @@ def resolve_backbone(name: str) -> type[nn.Module]:
         name for name in ("group", "taps", "forward") if name in left or not callable(getattr(found, name, None))
     ]
     if missing or not (isinstance(found, type) and issubclass(found, nn.Module)):
-        lacks = f"lacks {', '.join(missing)}" if missing else "is no torch.nn.Module"
+        lacks = f"lacks {', '.join(missing)}" if missing else "is not a torch.nn.Module"
         raise UsageError(f"backbone = {name}: {lacks}; docs/backbones.md shows the three methods")
     return found
 

@@ -82,7 +82,7 @@ class PointSlots(Backbone):
 
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Raises UsageError: there are no neighborhoods to look at."""
-        raise UsageError("the backbone slots has no neighborhoods and no dynamic stream; ask for what its scores say")
+        raise UsageError("the backbone slots has no neighborhoods and no dynamic stream; only its scores can be used")
 
 
 class _Member(nn.Module):

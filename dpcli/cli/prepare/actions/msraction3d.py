@@ -15,7 +15,7 @@ def msraction3d(
     raw: Annotated[Path, typer.Argument(help="Folder of aAA_sSS_eEE_sdepth.bin (official) or .mat files.")],
     *,
     focal: Annotated[
-        float, typer.Option("--focal", help="Focal length, pixels; the default is the published protocols'.")
+        float, typer.Option("--focal", help="Focal length, pixels; the default is that of the published protocols.")
     ] = 280.0,
     scale: Annotated[float, typer.Option("--scale", help="Raw depth units per unit of length in the output.")] = 300.0,
     train_subjects: Annotated[

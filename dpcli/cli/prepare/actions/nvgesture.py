@@ -19,7 +19,7 @@ def nvgesture(
         typer.Option("--foreground", help="otsu: only the hand, by Otsu's threshold. none: every pixel with a depth."),
     ] = "otsu",
     erode: Annotated[
-        int, typer.Option("--erode", min=0, max=1000, help="Pixels taken off the hand's rim (3x3 erosions).")
+        int, typer.Option("--erode", min=0, max=1000, help="Pixels eroded from the hand's rim (3x3 erosions).")
     ] = 1,
     coordinates: PixelCoordinates = "image",
     conversion: ConversionOptions,

@@ -19,8 +19,7 @@ def preprocessed(
     form: Annotated[
         Literal["auto", "msraction3d", "ntu60", "pts_label"],
         typer.Option(
-            "--form",
-            help="msraction3d, ntu60: one .npz per video. pts_label: gestures. auto: told by the first file found.",
+            "--form", help="msraction3d, ntu60: one .npz per video. pts_label: gestures. auto: by the first file found."
         ),
     ] = "auto",
     labels: Annotated[
@@ -36,7 +35,7 @@ def preprocessed(
     ] = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Read clouds others have made: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
+    """Read clouds made by others' code: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
     from dpcli.prepare.actions.preprocessed import open_preprocessed
 
     run_conversion(

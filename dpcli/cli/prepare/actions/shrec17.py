@@ -20,7 +20,7 @@ def shrec17(
     bbox: Annotated[
         bool,
         typer.Option(
-            "--bbox/--no-bbox", help="Only the hand's region in general_informations.txt, or the whole frame."
+            "--bbox/--no-bbox", help="Read only the hand's region of general_informations.txt, or the whole frame."
         ),
     ] = True,
     foreground: Annotated[

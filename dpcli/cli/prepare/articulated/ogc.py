@@ -26,11 +26,11 @@ class RoomConversion(ConversionOptions):
     """Holds the options of every conversion, with the number of points that the published rooms have."""
 
     points: Annotated[
-        int, typer.Option("--points", min=0, help="Points per frame. Default: all of the released, 2048 of new rooms.")
+        int, typer.Option("--points", min=0, help="Points per frame. Default: all in released rooms, 2048 in new ones.")
     ] = 0
     sampling: Annotated[
         Literal["random", "fps", "voxel"],
-        typer.Option("--sampling", help="How --points chooses among the released; new rooms always take fps."),
+        typer.Option("--sampling", help="How --points chooses in released rooms; new rooms always use fps."),
     ] = "fps"
 
 

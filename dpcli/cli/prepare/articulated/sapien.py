@@ -21,7 +21,7 @@ def sapien(
     validation_categories: ValidationCategories = "",
     fractions: CategoryFractions = "",
     allow_outside: Annotated[
-        bool, typer.Option("--allow-outside", help="Meshes may lie outside RAW: through links, .. or absolute paths.")
+        bool, typer.Option("--allow-outside", help="Meshes may be outside RAW: through links, .. or absolute paths.")
     ] = False,
     conversion: ArticulatedConversion,
 ) -> None:

@@ -27,7 +27,8 @@ def merge(
     prefix: Annotated[
         bool,
         typer.Option(
-            "--prefix", help="Samples are named FILE/NAME (FOLDER/NAME of files called alike): names may repeat."
+            "--prefix",
+            help="Name samples FILE/NAME (FOLDER/NAME for files of the same name), so that names may repeat in the inputs.",
         ),
     ] = False,
     compression: Compression = "none",

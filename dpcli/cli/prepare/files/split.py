@@ -34,9 +34,12 @@ class SplitOptions:
         str, typer.Option("--fractions", help="Draw shares train,validation,test, such as 0.8,0.1,0.1.")
     ] = ""
     stratify: Annotated[
-        bool, typer.Option("--stratify/--no-stratify", help="Each class in these fractions (not with --by-subject).")
+        bool,
+        typer.Option("--stratify/--no-stratify", help="Divide each class in these fractions (not with --by-subject)."),
     ] = True
-    by_subject: Annotated[bool, typer.Option("--by-subject", help="All of a subject's samples in one split.")] = False
+    by_subject: Annotated[bool, typer.Option("--by-subject", help="Keep all of a subject's samples in one split.")] = (
+        False
+    )
     seed: Seed = 0
 
     def choice(self) -> SplitChoice:

@@ -28,7 +28,7 @@ def kitti_det(
     coordinates: SceneCoordinates = "published",
     conversion: PublishedConversion,
 ) -> None:
-    """Read KITTI 3D detection: 7,481 Velodyne scans, objects are what the labeled boxes hold."""
+    """Read KITTI 3D detection: 7,481 Velodyne scans, objects are the points in the labeled boxes."""
     from dpcli.prepare.scans.kitti_det import KittiDetection
     from dpcli.prepare.scans.kitti_files import View
 

@@ -21,7 +21,9 @@ def kitti_sf(
     ] = "car,bus",
     labels: Annotated[
         Literal["instance", "obj_map"],
-        typer.Option("--labels", help="Images that tell objects: instance, or obj_map (moving ones, of all classes)."),
+        typer.Option(
+            "--labels", help="Images that label objects: instance, or obj_map (moving objects of all classes)."
+        ),
     ] = "instance",
     far: Far = 35.0,
     coordinates: SceneCoordinates = "published",

@@ -14,7 +14,7 @@ def modelnet40(
     raw: Annotated[Path, typer.Argument(help="Folder modelnet40_ply_hdf5_2048: ply_data_train0.h5 ... and the lists.")],
     conversion: ConversionOptions,
 ) -> None:
-    """Read ModelNet40: 12,308 shapes of 40 kinds, one frame each, to pretrain a static stream with."""
+    """Read ModelNet40: 12,308 shapes of 40 kinds, one frame each, to pretrain a static stream."""
     from dpcli.prepare.scans.modelnet40 import ModelNet40
 
     run_conversion("modelnet40", lambda: ModelNet40(raw), conversion, raw)

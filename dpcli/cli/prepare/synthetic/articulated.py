@@ -20,7 +20,7 @@ def articulated(
     ] = 260,
     sequences_per_object: SequencesPerObject = 4,
     kinds: Annotated[
-        str, typer.Option("--kinds", help="Make only these kinds, such as laptop,scissors,lamp. Default: all 22.")
+        str, typer.Option("--kinds", help="Make only these kinds, such as laptop,scissors,lamp. Default: all 26.")
     ] = "",
     test_categories: TestCategories = "",
     validation_categories: ValidationCategories = "",

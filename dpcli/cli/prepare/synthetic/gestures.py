@@ -22,7 +22,7 @@ def gestures(
         typer.Option(
             "--subjects",
             max=100_000,
-            help="People, of whom as many are seen as a class has videos; the first 60 % of them train.",
+            help="People (at most as many as a class has videos); the first 60 % of them are for training.",
         ),
     ] = 10,
     size: Annotated[int, typer.Option("--size", max=4096, help="Image width, pixels; the height is 3/4 of it.")] = 160,

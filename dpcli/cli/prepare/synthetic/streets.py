@@ -18,12 +18,12 @@ def streets(
     rate: Annotated[float, typer.Option("--rate", help="Frames per second.")] = 10.0,
     speed: Annotated[float, typer.Option("--speed", help="The lidar's own highest speed, m/s.")] = 12.0,
     noise: Annotated[float, typer.Option("--noise", help="Noise of ranges (standard deviation), meters.")] = 0.02,
-    dropout: Annotated[float, typer.Option("--dropout", help="Share of rays that are lost anywhere.")] = 0.05,
+    dropout: Annotated[float, typer.Option("--dropout", help="Share of rays that are lost, at random.")] = 0.05,
     conversion: ConversionOptions,
 ) -> None:
     """Make streets with cars, buses, cyclists and people, scanned by a spinning lidar that drives along.
 
-    Part 0 is all that stands. Poses give the true motion of every point.
+    Part 0 is everything that stands still. Poses give the true motion of every point.
     """
     from dpcli.prepare.synthetic.streets import SyntheticStreets
 

@@ -25,7 +25,7 @@ class FilmingOptions:
     output: FileOrPipe = ""
     size: PictureSize = 512
     azimuths: Annotated[
-        str, typer.Option("--azimuths", help="Azimuths of the test views, degrees; the input view stands at 0.")
+        str, typer.Option("--azimuths", help="Azimuths of the test views, degrees; the input view is at 0.")
     ] = "15,-75,105,195"
     train_azimuths: Annotated[
         str, typer.Option("--train-azimuths", help="Azimuths of further views to fit to, degrees, such as 90,180.")
@@ -33,13 +33,21 @@ class FilmingOptions:
     elevation: Annotated[float, typer.Option("--elevation", help="Elevation of all cameras, degrees, up = +.")] = 0.0
     yaw: Annotated[
         float | None,
-        typer.Option("--yaw", help="Turns the object about the upright, degrees; 0 faces the input camera."),
+        typer.Option(
+            "--yaw", help="Rotation of the object about the vertical, degrees; at 0 it faces the input camera."
+        ),
     ] = None
     travel: Annotated[
-        bool, typer.Option("--travel/--no-travel", help="Keep where it goes; without, it stays as on a treadmill.")
+        bool,
+        typer.Option(
+            "--travel/--no-travel",
+            help="Keep the object's travel; without it, the object stays in place as on a treadmill.",
+        ),
     ] = True
     samples: Annotated[int, typer.Option("--samples", min=1, max=8, help="N x N rays per pixel.")] = 2
-    shading: Annotated[float, typer.Option("--shading", help="0 plain colors .. 1 full light and shade.")] = 0.5
+    shading: Annotated[float, typer.Option("--shading", help="From 0 (plain colors) to 1 (full light and shade).")] = (
+        0.5
+    )
     tracks: Annotated[
         int,
         typer.Option(

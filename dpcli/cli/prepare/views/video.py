@@ -43,7 +43,10 @@ class CutOutOptions:
         ),
     ] = "auto"
     tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Difference from the background's color that counts as none, 0 to 0.5.")
+        float,
+        typer.Option(
+            "--tolerance", help="Difference from the background's color, 0 to 0.5, up to which a pixel is background."
+        ),
     ] = 0.06
     holes: Annotated[
         Literal["auto", "keep", "cut"],

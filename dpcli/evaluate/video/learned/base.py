@@ -64,7 +64,7 @@ class LearnedMetric(ABC):
 
 
 class FrameGap:
-    """Tells whether frames of a view were left out before the one at hand, which then has no neighbor before it."""
+    """Tells whether frames of a view were left out before the current one, which then has no neighbor before it."""
 
     def __init__(self) -> None:
         self._next: int | None = None

@@ -138,7 +138,7 @@ class ArraySource(Source):
                     f"{self.path}: frame {frame} has values down to {smallest:g}; floats are taken as 0..1: of -1..1 save "
                     "(x + 1) / 2"
                 )
-            with np.errstate(invalid="ignore"):  # NaN is found, and said, by whoever compares
+            with np.errstate(invalid="ignore"):  # the comparison finds and reports NaN
                 colored = values[..., :3] * values[..., 3:]
             yield Picture(values=np.concatenate([colored, values[..., 3:]], -1, dtype=np.float32))
 

@@ -15,13 +15,13 @@ class ShapeSchedule:
     """Holds how long a shape network learns, from pictures of which size, and how often it sees each."""
 
     steps: int = setting(20_000, "Steps of the optimizer.", least=1)
-    batch: int = setting(64, "Pictures per step, in which the turn of the whole is learned.", least=1)
-    decoded: int = setting(16, "Pictures of each step in which the layers are learned, too: the easier part.", least=1)
+    batch: int = setting(64, "Pictures per step, on which the rotation of the whole object is learned.", least=1)
+    decoded: int = setting(16, "Pictures of each step on which the layers are learned, too: the easier part.", least=1)
     size: int = setting(
         64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16, most=1024
     )
     lr: float = setting(2e-3, "Largest learning rate; it falls to zero as a cosine.", above=0)
-    round: int = setting(1024, "Pictures that are made at a time; a training begins with four times as many.", least=1)
+    round: int = setting(1024, "Pictures made per round; a training begins with four times as many.", least=1)
     rounds: int = setting(24, "Rounds of pictures that are kept.", least=1)
     reuse: int = setting(6, "Times that a picture is seen.", least=1)
     bfloat16: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
@@ -42,7 +42,9 @@ class ShapeData:
     warp: float = setting(
         0.1, "How far smooth waves bend and swell each model, so that its proportions differ.", least=0, most=0.3
     )
-    held_out: str | None = setting(None, "A text file with models for validation alone, one path or its end a line.")
+    held_out: str | None = setting(
+        None, "A text file of models used for validation only, one path or end of a path per line."
+    )
     validation: int = setting(384, "Pictures of held-out models that choose the best weights.", least=1)
     init: str | None = setting(None, "Weights to start from: a file or a folder of an earlier training.")
 

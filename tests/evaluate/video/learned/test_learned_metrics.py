@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.networks.clip import Clip, clip_across_views, clip_similarity, clip_spherical, clip_temporal
+from dpcli.evaluate.networks.clip import Clip
 from dpcli.evaluate.networks.lpips import Lpips
 from dpcli.evaluate.video.comparison import evaluate_video
 from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
@@ -76,6 +76,12 @@ def fake_networks(monkeypatch, no_weights: Path) -> None:
     monkeypatch.setattr(FeatureNetwork, "load", classmethod(load))
 
 
+def mean_of_view_pairs(rows: np.ndarray) -> float:
+    """The mean cosine over pairs of views at one time, of unit rows (V,T,D)."""
+    views, frames = rows.shape[:2]
+    return float(np.mean([rows[v, t] @ rows[w, t] for t in range(frames) for v in range(views) for w in range(v)]))
+
+
 def test_each_metric_is_that_of_its_own_function(files, fake_networks) -> None:
     report = evaluate_video(
         *files, metrics=("lpips", "clip", "clip_spherical", "clip_views", "clip_temporal", "warping")
@@ -91,14 +97,15 @@ def test_each_metric_is_that_of_its_own_function(files, fake_networks) -> None:
 
     rows = [np.stack([FakeClip().embed(np.moveaxis(view, 1, -1)) for view in video]) for video in (ours, theirs)]
     swapped = [np.stack([FakeClip().embed(np.moveaxis(v, 1, -1), bgr=True) for v in video]) for video in (ours, theirs)]
-    assert value["clip"] == pytest.approx(np.mean([clip_similarity(p, t) for p, t in zip(*rows)]), abs=1e-6)
-    assert value["clip_spherical"] == pytest.approx(np.mean([clip_spherical(p, t) for p, t in zip(*swapped)]), abs=1e-6)
-    assert value["clip_views"] == pytest.approx(clip_across_views(rows[0]), abs=1e-6)
-    assert report.learned["clip_views"].truth == pytest.approx(clip_across_views(rows[1]), abs=1e-6)
-    assert value["clip_temporal"] == pytest.approx(np.mean([clip_temporal(view) for view in rows[0]]), abs=1e-6)
-    assert report.learned["clip_temporal"].truth == pytest.approx(
-        np.mean([clip_temporal(v) for v in rows[1]]), abs=1e-6
-    )
+    angles = np.arccos(np.clip((swapped[0] * swapped[1]).sum(-1), -1, 1))
+    assert value["clip"] == pytest.approx((rows[0] * rows[1]).sum(-1).mean(), abs=1e-6)
+    assert value["clip_spherical"] == pytest.approx((angles**2 / 2).mean(), abs=1e-5)
+    for name, of in (
+        ("clip_views", mean_of_view_pairs),
+        ("clip_temporal", lambda own: (own[:, 1:] * own[:, :-1]).sum(-1).mean()),
+    ):
+        assert value[name] == pytest.approx(of(rows[0]), abs=1e-6)
+        assert report.learned[name].truth == pytest.approx(of(rows[1]), abs=1e-6)
 
     parts = []
     for video, truth in zip(ours, theirs):
@@ -190,7 +197,7 @@ def test_views_are_compared_at_the_same_time_whatever_each_lost(tmp_path: Path, 
     assert found.counts == {"views": 3, "frames": 4} and found.choices["frames left out"].startswith("2,")
     for value, video in ((found.value, ours), (found.truth, theirs)):
         rows = np.stack([FakeClip().embed(np.moveaxis(view[[0, 2, 3, 5]], 1, -1)) for view in video])
-        assert value == pytest.approx(clip_across_views(rows), abs=1e-6)
+        assert value == pytest.approx(mean_of_view_pairs(rows), abs=1e-6)
 
 
 def test_views_without_a_common_frame_or_a_pair_say_so(tmp_path: Path, fake_networks) -> None:

@@ -86,7 +86,7 @@ def test_a_video_file_is_opaque(tmp_path: Path) -> None:
     assert report.views[0].metrics.psnr > 38 and any("has no alpha" in note for note in report.notes)
     turned = evaluate_video(one, tmp_path / "a.avi")
     assert turned.names == ("psnr", "ssim")  # without alpha nobody knows the object
-    with pytest.raises(DataError, match="no alpha, so nobody knows"):
+    with pytest.raises(DataError, match="no alpha, so the object's pixels are unknown"):
         evaluate_video(one, tmp_path / "a.avi", metrics=("psnr_foreground",))
 
 
