@@ -211,7 +211,7 @@ def _texts(base: Path, _rng: np.random.Generator) -> None:
     )
     (base / "labels.csv").write_text("name,label,split,subject\na.npy,0,train,1\nb.npy,1,test,2\n")
     (base / "map.toml").write_text('[labels]\ndrawer = "all"\n')
-    (base / "split.csv").write_text("name,split\n")
+    (base / "split.csv").write_text("name,split\ng01_s01_v0001,test\n")
     (base / "classify.toml").write_text("epochs = 1\nepochs_dynamic = 1\n")
     (base / "segment.toml").write_text("epochs = 1\npairs_per_epoch = 2\n")
     (base / "flow.toml").write_text("iterations = 2\npoints = 32\n")

@@ -243,7 +243,7 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
     words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", *steps(20, 20))
     done = dpc_here(*words, "--picture", tmp_path / "first.png")
-    assert done.returncode == 0 and done.stderr.count(b"preview.png: a look at it from all sides") == 1
+    assert done.returncode == 0 and done.stderr.count(b"preview.png: a preview from all sides") == 1
     before = scene.read_bytes()
     done = dpc_here(*words, "--picture", tmp_path / "later.png")
     assert done.returncode == 0 and b"already complete" in done.stderr and scene.read_bytes() == before

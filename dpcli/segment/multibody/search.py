@@ -15,7 +15,7 @@ from dpcli.segment.multibody.splits import split_bodies
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _SPLIT_GAIN = 1e-4  # of the energy, for which a round of splits is kept
-_SHOWN = 0.8  # share of the matches in other frames of a body's points that are its own points, at least
+_SHOWN = 0.6  # share of the matches in other frames of a body's points that are its own points, at least
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 

@@ -322,6 +322,6 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
 @pytest.mark.parametrize("row", [[-1.0, 1.0, 1.0], [30.0, 15.0, 5.0], [0.3, 0.3, 0.3], [0.0, 0.0, 0.0]])
 def test_scores_that_are_no_probabilities_are_refused(row, two, tmp_path):
     odd = write(tmp_path / "odd.h5", {**POINTS, "v1": (1, row)})
-    with pytest.raises(DataError, match=r"odd.h5: scores of 'v1' are no probabilities \(1 such samples\)"):
+    with pytest.raises(DataError, match=r"odd.h5: scores of 'v1' are not probabilities \(1 such samples\)"):
         fuse([two[0], odd], tmp_path / "out.h5")
     assert not (tmp_path / "out.h5").exists()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -19,6 +19,7 @@ DEPTHS = st.tuples(st.integers(1, 9), st.integers(1, 9)).flatmap(
 )
 
 
+@settings(deadline=None)  # the first example compiles the kernel
 @given(DEPTHS)
 def test_what_was_packed_is_unpacked(depth):
     assert np.array_equal(unpack_rvl(Path("a.bag"), pack_rvl(depth)), depth)

@@ -369,7 +369,7 @@ BAD = {
         lambda a: (a / "CamPose.inf").write_text(inf_rows(camera_poses()[:3])),
         "3 cameras, Intrinsic.inf 8",
     ),
-    "words": (lambda a: (a / "CamPose.inf").write_text("a b c"), "no numbers"),
+    "words": (lambda a: (a / "CamPose.inf").write_text("a b c"), "not numbers"),
     "short rows": (lambda a: (a / "CamPose.inf").write_text("1 2 3\n"), "rows of 12"),
     "intrinsics": (lambda a: (a / "Intrinsic.inf").write_text("0\n1 0 0\n"), "10 per camera"),
     "no alpha": (lambda a: (a / "img/walk/2/img_0000_alpha.png").unlink(), "lacks the alpha of camera 0"),
