@@ -5,7 +5,14 @@ from __future__ import annotations
 
 def main() -> None:
     """Run `dpc` with the words of the command line."""
-    from dpcli.signal_exit import acknowledge_signal, start_watchdog, watch_signals
+    from dpcli.signal_exit import (
+        INTERRUPTED,
+        acknowledge_signal,
+        end_at_once,
+        signal_outcome,
+        start_watchdog,
+        watch_signals,
+    )
 
     watch_signals()
     import sys
@@ -22,9 +29,11 @@ def main() -> None:
         from dpcli.cli.app import main
 
         main()
-    except KeyboardInterrupt:  # while libraries load; later, commands say what they keep
-        sys.stderr.write("dpc: error: interrupted\n")
-        sys.exit(130)
+    except KeyboardInterrupt:  # before or after the command's own work, which says what it keeps
+        code, said = signal_outcome() or (INTERRUPTED, "interrupted")
+        sys.stderr.write(f"dpc: error: {said}\n")
+        end_at_once(code)
+        sys.exit(code)
     finally:
         acknowledge_signal()
 

@@ -102,6 +102,57 @@ def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):
     assert ended >= 2
 
 
+AT_A_LINE = """
+import io, os, signal, sys
+import dpcli.__main__, dpcli.cli.app as app
+
+def run(at):  # in a fork: the command, with SIGTERM before the line of that number in what frames its work
+    seen = 0
+    def each(frame, event, argument):
+        nonlocal seen
+        if event == "line":
+            seen += 1
+            if seen == at + 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+        return each
+    codes = {dpcli.__main__.main.__code__, app.main.__code__, app._run.__code__}
+    os.dup2(said.fileno(), 1), os.dup2(said.fileno(), 2)
+    sys.argv = ["dpc", *sys.argv[1:]]
+    sys.settrace(lambda frame, event, argument: each if frame.f_code in codes else None)
+    try:
+        dpcli.__main__.main()
+    except SystemExit as ended:
+        sys.settrace(None)
+        sys.stdout.flush()
+        os._exit(ended.code if seen > at else 9)
+
+for at in range(1000):
+    said = open("said", "w+b")
+    child = os.fork()
+    if child == 0:
+        run(at)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    said.seek(0)
+    print(at, code, said.read())
+    if code == 9:
+        break
+"""
+
+
+def test_a_signal_at_any_line_around_the_work_is_a_sentence(folder):
+    """In what frames a command, where few moments of a clock fall: each line is taken in turn."""
+    words, env = [sys.executable, "-c", AT_A_LINE, *COMMANDS["info"]], {**os.environ, "PYTHONPATH": str(ROOT)}
+    told = subprocess.run(words, cwd=folder, env=env, capture_output=True, timeout=240, check=True).stdout.decode()
+    *lines, last = [line.split(" ", 2) for line in told.splitlines()]
+    assert last[1] == "9" and len(lines) >= 20, told
+    watched = next(n for n, (_, code, _) in enumerate(lines) if code != str(-signal.SIGTERM))
+    assert watched < 8  # imports, one a line, and the call itself
+    for at, code, said in lines[watched:]:
+        assert (
+            code == "75" and said.count("dpc: error: stopped by SIGTERM") == 1 or code == "0" and "dpc:" not in said
+        ), (at, said)
+
+
 def test_a_stopped_command_waits_for_no_thread(folder):
     """Nor for a library's, which may never come back from what the signal broke off."""
     code = """
