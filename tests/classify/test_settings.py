@@ -108,6 +108,8 @@ def test_pretraining_is_one_frame_and_no_dynamic_stage():
         ({"init": "a", "static_from": "b"}, "give one of them"),
         ({"augment_speed": 0.3, "timing": "uniform"}, "augment_speed = 0.3: speed changes random clips"),
         ({"augment_speed": 0.3, "clips_per_video": 0}, "augment_speed = 0.3: speed changes random clips"),
+        ({"video_loss": True, "clips_per_video": 0}, "video_loss = true with clips_per_video = 0: expected two clips"),
+        ({"video_loss": True, "clips_per_video": 1}, "video_loss = true with clips_per_video = 1: expected two clips"),
         ({"neighbors": 2}, "temporal_radius = 1: balanced grouping shares 2 neighbors among 3 frames"),
         ({"backbone": "dgcnn", "static_temporal_radius": 0}, "dgcnn's one graph serves both streams"),
     ],

@@ -128,26 +128,38 @@ class ClipSource:
             return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
 
-    def epoch(self, number: int, per_video: int | None) -> list[Clip]:
-        """Returns the clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
+    def epoch(self, number: int, per_video: int | None, together: bool = False) -> list[Clip]:
+        """Returns the clips of one training epoch in random order: every start of every video, or `per_video` random ones.
+
+        together: a video's clips follow each other, each from another of as many equal parts of the video (Wang et al.,
+        "Temporal Segment Networks", ECCV 2016).
+        """
         rng = generator(self.seed, ClassifyStream.CLIPS, number)
+        if together and per_video:
+            videos = [[self._random_clip(s, rng, k, per_video) for k in range(per_video)] for s in self.sequences]
+            return [clip for i in rng.permutation(len(videos)) for clip in videos[i]]
         if per_video is None and self.timing == "clips":
             clips = self.clips(None)
         else:
             clips = [self._random_clip(s, rng) for s in self.sequences for _ in range(per_video or 1)]
         return [clips[i] for i in rng.permutation(len(clips))]
 
-    def _random_clip(self, sequence: int, rng: np.random.Generator) -> Clip:
+    def _random_clip(self, sequence: int, rng: np.random.Generator, part: int = 0, parts: int = 1) -> Clip:
+        """Returns a clip that starts in one of the equal parts of all starts of a video."""
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "slots":
             return Clip(sequence, tuple(range(length)))
         if self.timing == "uniform":
             lost = int(rng.uniform(0, self.augmentation.crop) * length)
             start = int(rng.integers(lost + 1))
-            return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random())))
+            return Clip(
+                sequence, tuple(start + t for t in uniform_frames(length - lost, frames, (part + rng.random()) / parts))
+            )
         steps = self.augmentation.frame_steps(frames, rng)
         span = int(steps[-1]) + 1
-        shown = clip_frames(length, span, int(rng.integers(max(length - span, 0) + 1)))
+        starts = max(length - span, 0) + 1
+        first, end = part * starts // parts, (part + 1) * starts // parts
+        shown = clip_frames(length, span, int(rng.integers(first, max(end, first + 1))))
         return Clip(sequence, tuple(shown[step] for step in steps))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:

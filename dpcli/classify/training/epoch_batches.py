@@ -64,10 +64,12 @@ class EpochBatches:
         yield from torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, mine), self.share, **options)
 
     def _draw(self, number: int) -> list[Clip]:
-        return self.source.epoch(number, self.schedule.clips_per_video or None)
+        return self.source.epoch(number, self.schedule.clips_per_video or None, self.schedule.video_loss)
 
     def _order(self, epoch: int, clips: int) -> list[int]:
         """Returns the order in which an epoch takes its clips: as drawn, or, where draws come back, another one each time."""
         if not self.draws:
             return list(range(clips))
-        return generator(self.source.seed, ClassifyStream.DRAW_ORDER, epoch).permutation(clips).tolist()
+        together = self.schedule.clips_per_loss
+        order = generator(self.source.seed, ClassifyStream.DRAW_ORDER, epoch).permutation(clips // together)
+        return (order[:, None] * together + np.arange(together)).ravel().tolist()

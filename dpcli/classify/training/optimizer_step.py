@@ -93,11 +93,14 @@ class StageStep:
         groups = [self.neighbors(points, *which)] if self.neighbors is not None and which else []
         with reduced_products(self.device, self.amp):
             logits = self.module(points, *groups).float()
+        together = self.schedule.clips_per_loss
+        logits, labels = logits.unflatten(0, (-1, together)).mean(1), labels[::together]
         loss = nn.functional.cross_entropy(
             logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
         )
+        loss = loss * together  # each clip of a video counts what the video does
         (loss / clips).backward()
-        return float(loss.detach()), int((logits.argmax(-1) == labels).sum())
+        return float(loss.detach()), together * int((logits.argmax(-1) == labels).sum())
 
     def _without_exchange(self, on: bool) -> contextlib.AbstractContextManager:
         """Keeps gradients to the process: they are exchanged once a step, not after its earlier parts."""

@@ -40,6 +40,11 @@ class Schedule:
         " the number of videos per class. With --init the preset auto takes auto and the model's own network.",
     )
     clips_per_video: int = setting(1, "Random clips per video and epoch; 0 takes every start.", least=0)
+    video_loss: bool = setting(
+        False,
+        "True: one loss per video, of the mean logits of its clips_per_video clips, each from another part of it, as a prediction"
+        " averages them; false: one loss per clip.",
+    )
     validate_every: int = setting(1, "Epochs from one validation to the next.", least=1)
     validation_clips: int = setting(4, "Clips per video in a validation.", least=1)
     accumulate: int = setting(
@@ -63,6 +68,16 @@ class Schedule:
 
     def __post_init__(self) -> None:
         check(self)
+        if self.video_loss and self.clips_per_video < 2:
+            raise UsageError(
+                f"video_loss = true with clips_per_video = {self.clips_per_video}: expected two clips per video or more, such as"
+                " clips_per_video = 4"
+            )
+
+    @property
+    def clips_per_loss(self) -> int:
+        """Returns how many clips, all of one video, a loss judges by the mean of their logits."""
+        return self.clips_per_video if self.video_loss else 1
 
     @property
     def stage_epochs(self) -> tuple[int, int]:
@@ -76,9 +91,14 @@ class Schedule:
         2
         """
         parts = processes * self.accumulate
-        if self.batch % parts:
+        if self.batch % (parts * self.clips_per_loss):
+            together = (
+                f" x clips_per_video = {self.clips_per_video}, which video_loss keeps together"
+                if self.video_loss
+                else ""
+            )
             raise UsageError(
                 f"batch = {self.batch}: the batch of all together has to divide by {processes} processes"
-                f" x accumulate = {self.accumulate}"
+                f" x accumulate = {self.accumulate}{together}"
             )
         return self.batch // parts

@@ -121,6 +121,20 @@ def test_the_draw_depends_on_the_key_alone(reader):
     )  # every start occurs
 
 
+@pytest.mark.parametrize("timing", ["clips", "uniform"])
+def test_clips_of_a_video_that_stay_together_come_from_all_its_parts(reader, timing):
+    source = ClipSource(reader, [2, 3], CONFIG, timing=timing, seed=5)
+    for number in range(40):
+        clips = source.epoch(number, 3, together=True)
+        assert [clip.sequence for clip in clips] in ([2, 2, 2, 3, 3, 3], [3, 3, 3, 2, 2, 2])
+        starts = [clip.frames for clip in clips if clip.sequence == 3]  # of ten frames: seven starts
+        assert starts == sorted(starts)
+        if timing == "clips":
+            assert all(first in part for (first, *_), part in zip(starts, ((0, 1), (2, 3), (4, 5, 6))))
+    seen = {clip.frames for number in range(60) for clip in source.epoch(number, 3, together=True)}
+    assert seen >= {clip.frames for clip in source.clips(None) if timing == "clips"}
+
+
 def test_points_are_drawn_without_replacement_or_in_whole_copies():
     rng = np.random.default_rng(0)
     frame = np.arange(30, dtype=np.float32).reshape(10, 3)

@@ -138,8 +138,11 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
     assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] == 0
 
 
-def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):
-    words = (*SMALL, "--set", "epochs_dynamic=3", "--set", "draws=2")
+@pytest.mark.parametrize(
+    "more", [(), ("--set", "clips_per_video=2", "--set", "video_loss=true")], ids=["clip", "video"]
+)
+def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch, more):
+    words = (*SMALL, "--set", "epochs_dynamic=3", "--set", "draws=2", *more)
     assert dpc("classify", "train", data, "-o", tmp_path / "whole", *words) == 0
     take, taken = training.Trainer._take, []
 

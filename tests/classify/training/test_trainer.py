@@ -141,6 +141,32 @@ def test_a_batch_in_parts_has_the_gradient_of_the_batch():
         Schedule(batch=4).share(3)
 
 
+def test_a_loss_per_video_is_that_of_its_clips_mean_logits():
+    """And its gradient is; a step in parts, each of whole videos, adds up to the same."""
+    torch.manual_seed(0)
+    config = network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3)
+    points, labels = torch.randn(6, 2, 64, 3) * 0.3, torch.tensor([0, 0, 1, 1, 2, 2])
+    grads = []
+    for parts in (1, 3):
+        torch.manual_seed(1)
+        model = Kinet(config).eval()
+        schedule = Schedule(1, 1, batch=6, clips_per_video=2, video_loss=True, accumulate=parts)
+        total, right, _ = StageStep(model, 0, schedule, torch.device("cpu"), Processes())(points, labels, 0.0)
+        grads.append(model.static.stage2.linear2.weight.grad.clone())
+        model.zero_grad()
+        logits = model.static_logits(points)
+        means = torch.stack([(logits[i] + logits[i + 1]) / 2 for i in (0, 2, 4)])
+        loss = -torch.log_softmax(means, -1)[torch.arange(3), torch.arange(3)].mean()
+        assert total / 6 == pytest.approx(float(loss.detach()), rel=1e-5)
+        assert right == 2 * int((means.argmax(-1) == torch.arange(3)).sum())
+    loss.backward()
+    for grad in grads:
+        assert float(grad.norm()) > 1e-5
+        torch.testing.assert_close(grad, model.static.stage2.linear2.weight.grad, rtol=1e-3, atol=1e-7)
+    with pytest.raises(UsageError, match="2 processes x accumulate = 1 x clips_per_video = 4, which video_loss keeps"):
+        Schedule(batch=4, clips_per_video=4, video_loss=True).share(2)
+
+
 def test_processes_that_can_t_share_a_batch_evenly_are_refused():
     check_shares(3, Schedule(batch=4), 1)
     check_shares(4, Schedule(batch=4), 2)
