@@ -60,6 +60,11 @@ PRESETS = {
         "release",
     ),
     "quick": _preset(KinetConfig(**_SMALL), Schedule(80, 60, batch=8, weight_decay=0.01, label_smoothing=0.1), "ours"),
+    "long": _preset(
+        KinetConfig(**_SMALL),
+        Schedule(40, 30, batch=32, weight_decay=0.01, label_smoothing=0.1, clips_per_video=4, video_loss=True),
+        "ours",
+    ),
     "tiny": _preset(KinetConfig(**_TINY), Schedule(20, 40, batch=8, learning_rate=2e-3, weight_decay=0.01), "ours"),
     "sparse": _preset(
         KinetConfig(**_SPARSE),
@@ -138,4 +143,5 @@ def backbone_changes(preset: str, backbone: str) -> dict[str, Any]:
     """
     if backbone == "pointnet2":
         return {"backbone": backbone}
+    preset = "quick" if preset == "long" else preset  # one network
     return {"backbone": backbone, "static_temporal_radius": None, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {})}

@@ -110,7 +110,13 @@ def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
         sets = {name: value for name, value in given.sets.items() if name != "fine_tune"}
         flags = {name: value for name, value in given.flags.items() if name != "fine_tune"}
         return training_settings(Given("quick", given.config, sets, flags), base)
-    settings = training_settings(_with_preset(given, preset_for(reader, given.values)))
+    preset = preset_for(reader, given.values)
+    settings = training_settings(_with_preset(given, preset))
+    if given.preset == AUTO and preset == "long":
+        log.info(
+            f"preset long: the median video has {int(np.median(reader.frame_counts))} frames, four clips of"
+            f" {settings.network.num_frames} or more; clips of a video are judged together (--preset quick: each for itself)"
+        )
     return replace(settings, schedule=resolved(settings.schedule, reader))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from dpcli.classify.data.augment import NONE, Augmentation
 from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.presets import PRESETS
 from dpcli.runtime.progress import log
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.schema import kept_name
@@ -26,18 +27,22 @@ _BOTH_SIGNS = 0.1  # of a column's values at least above and below 0: it is a sp
 
 
 SPARSE = 64  # points of a frame in the median, at most: what common radars send
+LONG = 4  # clips that the median video holds, at least, where a single one may show nothing of its class
 _OWN_CHOICE = ("backbone", "timing", "variant", "init", "static_from", "pretrain")  # settings that name another network
 
 
 def preset_for(reader: CloudsReader, given: Mapping[str, Any]) -> str:
-    """Returns the preset that suits a file: `sparse` for sparse clouds, unless what is given names another network, else
-    `quick`.
+    """Returns the preset that suits a file: `sparse` for sparse clouds, `long` for videos of `LONG` clips or more, else `quick`.
 
-    given: the values of settings that were given, by name.
+    given: the values of settings that were given, by name; where they name another network, `quick` it is.
     """
-    sizes = reader.frame_sizes
-    sparse = len(sizes) > 0 and float(np.median(sizes)) <= SPARSE
-    return "sparse" if sparse and not any(given.get(name) for name in _OWN_CHOICE) else "quick"
+    sizes, lengths = reader.frame_sizes, reader.frame_counts
+    if not len(sizes) or any(given.get(name) for name in _OWN_CHOICE):
+        return "quick"
+    if float(np.median(sizes)) <= SPARSE:
+        return "sparse"
+    frames = int(given.get("frames") or PRESETS["quick"]["network"].num_frames)
+    return "long" if float(np.median(lengths)) >= LONG * frames else "quick"
 
 
 def measured(config: KinetConfig, reader: CloudsReader, sequences: list[int]) -> tuple[KinetConfig, dict[str, str]]:

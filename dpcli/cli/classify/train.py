@@ -28,8 +28,9 @@ def train(
     """Train both streams: static, then dynamic on the frozen static weights. Running again continues a stopped run.
 
     Presets: thesis and release (its text and its published code), quick (a seventh of the operations, fits a CPU), tiny
-    (demo), sparse (at most 64 points a frame, as of a radar); auto takes sparse for such data, else quick. The folder's
-    settings.toml holds all settings; --config reads it back for an equal run.
+    (demo), sparse (at most 64 points a frame, as of a radar), long (quick for videos of four clips or more, whose clips
+    are judged together); auto takes sparse, long or quick, whichever suits the data. The folder's settings.toml holds all
+    settings; --config reads it back for an equal run.
 
     Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
     """

@@ -364,6 +364,35 @@ def test_the_settings_are_kept_read_back_and_shown(data, run_folder, dpc_here):
     assert "schedule epochs dynamic" in text and "run validation" in text
 
 
+@pytest.mark.parametrize("frames, preset", [("1", "long"), ("2", "quick")])
+def test_videos_of_four_clips_are_judged_as_a_whole_unless_a_preset_is_named(data, tmp_path, dpc_here, frames, preset):
+    small = (
+        "--frames",
+        frames,
+        "--points",
+        "64",
+        "--set",
+        "centroids=16,8",
+        "--set",
+        "neighbors=8",
+        "--epochs",
+        1,
+        "--set",
+        "epochs_dynamic=1",
+        "--validation",
+        "none",
+    )
+    done = dpc_here("classify", "train", data, "-o", tmp_path / "auto", *small)
+    assert done.returncode == 0, done.stderr.decode()
+    assert (b"preset long: the median video has 6 frames, four clips of 1 or more" in done.stderr) == (preset == "long")
+    schedule = json.loads((tmp_path / "auto" / "config.json").read_text())["schedule"]
+    assert schedule["video_loss"] == (preset == "long") and schedule["clips_per_video"] == (
+        4 if preset == "long" else 1
+    )
+    named = dpc_here("classify", "train", data, "-o", tmp_path / "quick", "--preset", "quick", *small)
+    assert named.returncode == 0 and b"preset long" not in named.stderr
+
+
 def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):
     words = ("classify", "train", data, "-o", tmp_path / "run", *TRAIN, "--set", "augment_speed=0.3")
     for more in (("--timing", "uniform"), ("--set", "clips_per_video=0")):

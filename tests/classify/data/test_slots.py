@@ -206,7 +206,13 @@ def test_the_data_choose_the_preset_unless_another_network_is_named(tmp_path):
     assert preset_for(sparse, {"backbone": "dgcnn"}) == "quick" and preset_for(sparse, {"init": "x"}) == "quick"
     (tmp_path / "dense").mkdir()
     config_of(tmp_path / "dense", [video(points=65)])
-    assert preset_for(CloudsReader(tmp_path / "dense" / "c.h5"), {}) == "quick"
+    dense = CloudsReader(tmp_path / "dense" / "c.h5")
+    length = int(dense.frame_counts[0])
+    assert (
+        preset_for(dense, {"frames": length // 4}) == "long"
+        and preset_for(dense, {"frames": length // 4 + 1}) == "quick"
+    )
+    assert preset_for(dense, {"frames": 1, "timing": "uniform"}) == "quick"
 
 
 def test_a_file_without_the_columns_is_refused(tmp_path):
