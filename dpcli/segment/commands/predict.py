@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import UsageError
+from dpcli.path_names import file_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.machines.once_per_process import OncePerProcess
@@ -235,5 +236,5 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
         if drawings.turntable is not None:
             turntable(drawings.turntable, reader.read(0))
         if drawings.ply is not None:
-            for index in range(len(reader)):
-                write_ply_frames(drawings.ply / reader.names[index].replace("/", "_"), reader.read(index))
+            for index, name in enumerate(file_names(reader.names)):
+                write_ply_frames(drawings.ply / name, reader.read(index))

@@ -51,7 +51,8 @@ def picture_of_scene(sequence: CloudSequence) -> tuple[CloudSequence, Look]:
     reach = np.linalg.norm(sequence.points - middle, axis=1)
     shown = np.flatnonzero(reach <= max(_SHOWN, float(np.percentile(reach, 20))))
     offsets = np.searchsorted(shown, sequence.frame_offsets)
-    up = find_up(sequence.frame(0).astype(np.float64), None)[0]
+    first = next(frame for frame in map(sequence.frame, range(sequence.num_frames)) if len(frame))
+    up = find_up(first.astype(np.float64), None)[0]
     axis = int(np.abs(up).argmax())
     sequence.take_points(shown, offsets)
     sequence.part = np.where(sequence.part == 0, -1, sequence.part).astype(np.int16)

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.segment.commands.joints import find_joints
-from dpcli.store import CloudsReader, PartsReader, PartsWriter
+from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code
 
@@ -126,6 +127,22 @@ def test_a_folder_holds_one_object_for_each_sequence(few, tmp_path, dpc_here):
     assert set(names[1:]) < set(found) and names[0] + "\\x1b[31m\\n" in found.values() and len(found) == len(names)
 
 
+def test_sequences_whose_names_are_one_file_name_have_a_file_each(few, tmp_path):
+    with h5py.File(shutil.copyfile(few, tmp_path / "odd.h5"), "r+") as file:
+        file["name"][:2] = ["a/b", "a:b"]
+    find_joints(str(tmp_path / "odd.h5"), tmp_path / "robots", sequence=None, picture=None, force=False)
+    names = {ElementTree.parse(path).getroot().get("name") for path in (tmp_path / "robots").glob("*.urdf")}
+    assert names == {"a/b", "a:b"}
+
+
+def test_one_frame_has_no_joints(tmp_path):
+    cloud = CloudSequence.from_frames("still", [np.eye(3, dtype=np.float32)], part=[np.arange(3)])
+    with PartsWriter(tmp_path / "p.h5", num_parts=3, class_names=[], length_unit="m") as writer:
+        writer.write(cloud, np.eye(3, dtype=np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 3, 4, 4)), [])
+    with pytest.raises(DataError, match="'still': one frame only, which shows no motion"):
+        find_joints(str(tmp_path / "p.h5"), tmp_path / "p.json", sequence=None, picture=None, force=False)
+
+
 def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatch):
     """Else the same command, which a full disk's sentence asks for, would be refused for what it had left."""
 
@@ -147,6 +164,7 @@ def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatc
     ("words", "code", "message"),
     [
         (["-o", "a.urdf"], 2, "name one with --sequence"),
+        (["-o", "a.URDF"], 2, "name one with --sequence"),
         (["-o", "a.urdf", "--sequence", "nobody"], 2, "--sequence nobody: not in"),
         (["-o", "a.xml"], 2, "expected a name that ends in .h5, .urdf, .json, or a folder"),
     ],

@@ -15,6 +15,7 @@ from dpcli.segment.scene.clusters import cluster
 from dpcli.segment.scene.ego_motion import register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import LineOfSight, range_jumps
+from dpcli.segment.scene.report import picture_of_scene
 from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.store import CloudSequence, CloudsWriter
@@ -191,6 +192,13 @@ def test_the_command_writes_a_parts_file_and_a_line_to_check(dpc_here, tmp_path)
     assert picture.stat().st_size > 1000
     done = dpc_here("evaluate", "segmentation", parts, "--truth", data, "--split", "all", "--json")
     assert json.loads(done.stdout)["metrics"]["f1"] > 0.9
+
+
+def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
+    cloud = street().frame(0)
+    sequence = CloudSequence.from_frames("s", [cloud[:0], cloud], part=[np.zeros(0, int), np.zeros(len(cloud), int)])
+    shown, look = picture_of_scene(sequence)
+    assert look.up == "z" and shown.frame_offsets[1] == 0 < len(shown.points)
 
 
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
