@@ -121,7 +121,9 @@ def _fingerprint(path: Path) -> str:
         if not path.is_dir():
             return str(path.stat().st_size)
         names = sorted(
-            name for name in os.listdir(path) if not name.startswith(".") and not name.lower().endswith((".h5", ".hdf5"))
+            name
+            for name in os.listdir(path)
+            if not name.startswith(".") and not name.lower().endswith((".h5", ".hdf5"))
         )
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
