@@ -202,6 +202,12 @@ def test_a_fit_that_runs_away_is_told(setting, tmp_path, dpc_here):
         assert np.isfinite(read_scene(out).frame_mean).all()
 
 
+def test_coarse_steps_shrink_a_picture_to_one_pixel_at_most(tmp_path, dpc_here):
+    views, small = toy_views(tmp_path / "toy.h5"), ("--preset", "tiny", "--prior", "none", "--size", 16, *steps(2, 1))
+    done = dpc_here("generate4d", "fit", views, "-o", tmp_path / "s.h5", *small, "--set", "coarse=0.5,100")
+    assert done.returncode == 0, done.stderr
+
+
 def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     from dpcli.generate4d.fit import COLUMNS
     from dpcli.runtime.run_folder import RunFolder
