@@ -97,10 +97,8 @@ class Report:
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
     """Returns everything that decides the file's content, except the seed: equal ones may continue each other."""
-    digest, fingerprint = (
-        hashlib.sha256("\n".join(reader.class_names).encode()),
-        cache(_fingerprint),
-    )  # items may share a folder
+    digest = hashlib.sha256("\n".join(reader.class_names).encode())
+    fingerprint = cache(_fingerprint)  # items may share a folder
     for item in items:
         facts = (item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path))
         digest.update("\n".join(map(str, facts)).encode())
