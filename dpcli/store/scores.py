@@ -47,6 +47,8 @@ class ScoresWriter(ResumableWriter):
         self._rejected = array("B")
         self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
         _check_classes(path, options.get("class_names", ()))
+        if wrong := [name for name in self.streams if not name or "/" in name or name == "."]:
+            raise DataError(f"{path}: a stream called {wrong[0]!r}; HDF5 needs a name without a slash")
         super().__init__(path, **options)
 
     def write(

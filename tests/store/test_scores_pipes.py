@@ -53,6 +53,8 @@ def test_bad_rows_are_refused(tmp_path):
                 writer.write(name, np.ones(2), label=label)
     with pytest.raises(DataError, match="1 class names repeat, such as 'a'"):
         ScoresWriter(tmp_path / "s.h5", class_names=["a", "b", "a"])
+    with pytest.raises(DataError, match="a stream called 'a/b'"):
+        ScoresWriter(tmp_path / "s.h5", class_names=["a"], streams=("a/b",))
     assert list(tmp_path.iterdir()) == []
 
 
