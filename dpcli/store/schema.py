@@ -17,6 +17,10 @@ from dpcli.errors import UsageError
 
 SCHEMA = 1
 KEPT = "field_"  # what the name of a column begins with that was kept on request
+METERS = {  # in each unit of length that is known by the name that `length_unit` has for it
+    **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3},
+    **{"ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937},
+}
 _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
 
 

@@ -96,7 +96,7 @@ def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, fo
 
 def _write_urdf(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
     for _, sequence, tree in trees:
-        write_urdf(output, tree, sequence.name)
+        write_urdf(output, tree, sequence.name, reader.length_unit)
         log.info(f"{output}: {len(tree.points)} links; meshes in {output.stem}_meshes")
 
 
@@ -119,7 +119,7 @@ def _write_folder(trees: Trees, output: Path, reader: PartsReader, path: Path, f
 def _fill_folder(folder: Path, trees: Trees, reader: PartsReader) -> None:
     objects, names = [], file_names(reader.names)
     for index, sequence, tree in trees:
-        write_urdf(folder / f"{names[index]}.urdf", tree, sequence.name)
+        write_urdf(folder / f"{names[index]}.urdf", tree, sequence.name, reader.length_unit)
         objects.append(tree_json(tree, sequence.name, reader.length_unit))
     write_trees(folder / "joints.json", objects)
 

@@ -230,7 +230,7 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
             shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
             sequences, look = [reader.read(int(i)) for i in shown], None
             if scene:
-                sequences, looks = zip(*map(picture_of_scene, sequences))
+                sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
                 look = looks[0]
             parts_picture(drawings.picture, sequences, look=look)
         if drawings.turntable is not None:

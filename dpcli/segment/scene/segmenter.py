@@ -16,8 +16,7 @@ from dpcli.segment.scene.tracking import moved
 from dpcli.segment.segmenters import Flows, Segmenter
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
-
-_METERS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0}
+from dpcli.store.schema import METERS
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class SceneSegmenter(Segmenter):
 
         Frames are looked at in the order of `time` where it is known; units that are no lengths count as meters.
         """
-        count, unit = sequence.num_frames, _METERS.get(length_unit, 1.0)
+        count, unit = sequence.num_frames, METERS.get(length_unit, 1.0)
         order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
         to_meters = np.diag([unit, unit, unit, 1.0])
         to_meters[:3, 3] = -unit * np.median(sequence.points, axis=0)

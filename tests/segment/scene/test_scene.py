@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from functools import lru_cache
@@ -104,6 +105,7 @@ SAME = {  # input that must be answered as the plain street is
     "y up": (turned, {}, "m"),
     "kilometers away": (lambda frames: frames, {"shift": np.array([4.5e5, 5.4e6, 120.0])}, "m"),
     "millimeters": (lambda frames: [1000 * frame for frame in frames], {}, "mm"),
+    "feet": (lambda frames: [frame / 0.3048 for frame in frames], {}, "ft"),
     "wrong time order": (lambda f: [f[2], f[0], f[1]], {"time": np.array([0.2, 0.0, 0.1])}, "m"),
     "duplicates": (lambda frames: [np.concatenate([frame, frame[::2]]) for frame in frames], {}, "m"),
     "sizes differ": (lambda f: [f[0], f[1][::3], f[2]], {}, "m"),
@@ -197,8 +199,10 @@ def test_the_command_writes_a_parts_file_and_a_line_to_check(dpc_here, tmp_path)
 def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
     cloud = street().frame(0)
     sequence = CloudSequence.from_frames("s", [cloud[:0], cloud], part=[np.zeros(0, int), np.zeros(len(cloud), int)])
-    shown, look = picture_of_scene(sequence)
-    assert look.up == "z" and shown.frame_offsets[1] == 0 < len(shown.points)
+    count = len(picture_of_scene(copy.copy(sequence), "m")[0].points)
+    sequence.points = 1000 * sequence.points
+    shown, look = picture_of_scene(sequence, "mm")
+    assert look.up == "z" and shown.frame_offsets[1] == 0 < len(shown.points) == count
 
 
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
