@@ -105,7 +105,7 @@ SAME = {  # input that must be answered as the plain street is
     "y up": (turned, {}, "m"),
     "kilometers away": (lambda frames: frames, {"shift": np.array([4.5e5, 5.4e6, 120.0])}, "m"),
     "millimeters": (lambda frames: [1000 * frame for frame in frames], {}, "mm"),
-    "feet": (lambda frames: [frame / 0.3048 for frame in frames], {}, "ft"),
+    "inches": (lambda frames: [frame / 0.0254 for frame in frames], {}, "in"),
     "wrong time order": (lambda f: [f[2], f[0], f[1]], {"time": np.array([0.2, 0.0, 0.1])}, "m"),
     "duplicates": (lambda frames: [np.concatenate([frame, frame[::2]]) for frame in frames], {}, "m"),
     "sizes differ": (lambda f: [f[0], f[1][::3], f[2]], {}, "m"),
