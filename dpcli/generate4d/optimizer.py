@@ -144,8 +144,7 @@ class SceneOptimizer:
 
     def _shrink_factor(self) -> int:
         share = self.step / self.config.steps
-        factor = next((factor for until, factor in self.config.coarse if share < until), 1)
-        return min(factor, *self.targets.size)
+        return next((factor for until, factor in self.config.coarse if share < until), 1)
 
     def _picture_terms(
         self, instant: Instant, views: list[int], frames: list[int], rng: torch.Generator
