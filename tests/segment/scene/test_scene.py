@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.prepare.synthetic.spinning_lidar import Lidar, scan
 from dpcli.prepare.synthetic.street_world import Mover, car, person, planar_pose, standing_street
 from dpcli.segment.scene.clusters import cluster
@@ -194,6 +195,12 @@ def test_the_command_writes_a_parts_file_and_a_line_to_check(dpc_here, tmp_path)
     assert picture.stat().st_size > 1000
     done = dpc_here("evaluate", "segmentation", parts, "--truth", data, "--split", "all", "--json")
     assert json.loads(done.stdout)["metrics"]["f1"] > 0.9
+
+
+def test_points_farther_apart_than_on_earth_are_no_scene():
+    far = CloudSequence.from_frames("f", [np.random.default_rng(t).random((50, 3)) * 1e11 for t in range(2)])
+    with pytest.raises(DataError, match=r"m apart, .* --unit \(the file's is m\)"):
+        SceneSegmenter(SceneSettings()).explain(far, [(0, 1)], "m")
 
 
 def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
