@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from dpcli.errors import DataError
 
 _ABSOLUTE = re.compile(r"\s*(/|[A-Za-z]:|file:|[A-Za-z][A-Za-z0-9+.-]*://)", re.IGNORECASE)
+_UNUSUAL = re.compile(r"[^\w.-]+")
 _LONGEST = 4095  # bytes of a path and, below, 255 of a name: Linux takes no more
 
 
@@ -42,6 +44,28 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
     stems = [as_utf8(Path(path).stem) for path in paths]
     folders = [as_utf8(Path(path).resolve().parent.name) for path in paths]
     return [folder or stem if stems.count(stem) > 1 else stem for stem, folder in zip(stems, folders)]
+
+
+def file_names(names: Sequence[str], otherwise: str = "object") -> list[str]:
+    """Returns a different name of a file or folder, without its suffix, for each of some names that stand in a file.
+
+    What is no letter, digit, `-`, `_` or `.` becomes `_`. Names that are the same then, also where capitals don't count,
+    get their number. otherwise: what one without any letter is called.
+
+    >>> file_names(["a/b", "a b", "..", "c"])
+    ['a_b_0', 'a_b_1', 'object', 'c']
+    """
+    plain = [_UNUSUAL.sub("_", name).strip("_.")[:60] or otherwise for name in names]
+    counts = Counter(name.lower() for name in plain)
+    taken = {name for name, count in counts.items() if count == 1}
+    for index, name in enumerate(plain):
+        if counts[name.lower()] > 1:
+            name = f"{name}_{index}"
+            while name.lower() in taken:
+                name += "_"
+            taken.add(name.lower())
+            plain[index] = name
+    return plain
 
 
 def path_inside(root: Path | None, folder: Path, name: str) -> Path:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dpcli.errors import DataError
-from dpcli.path_names import as_utf8, utf8_path
+from dpcli.path_names import as_utf8, file_names, utf8_path
 from dpcli.prepare.articulated.urdf import read_skeleton
 from dpcli.runtime.weights import load_weights, save_weights
 from dpcli.store import CloudsReader
@@ -64,3 +64,12 @@ def test_weights_and_urdfs_there_end_with_a_sentence(latin1):
     (latin1 / "robot.urdf").write_text('<robot name="r"><link name="a"/></robot>')
     with pytest.raises(DataError, match="yourdfpy can't open it; rename it"):
         read_skeleton(latin1 / "robot.urdf")
+
+
+def test_names_in_a_file_become_different_names_of_files():
+    """Also where a number that tells two apart is the name of a third, and where capitals make no difference."""
+    names = ["a_b_1", "a/b", "a:b", "..", "Walk", "walk", "𠀀" * 300, ""]
+    found = file_names(names)
+    assert found[:4] == ["a_b_1", "a_b_1_", "a_b_2", "object_3"]
+    assert len({name.lower() for name in found}) == len(names)
+    assert all(name and Path(name).name == name and name.strip(".") and len(os.fsencode(name)) < 250 for name in found)

@@ -16,7 +16,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.progress import log
-from dpcli.runtime.whole_file import check_replaced, not_writable, refuse_broken_link, whole_file
+from dpcli.runtime.whole_file import check_replaced, not_writable, refuse_broken_link, refuse_replacing, whole_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -55,8 +55,7 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
     A .png takes the first one. Nothing half-written stays under the name. Raises UsageError when it exists and `force` is off.
     """
     kind = output_kind(path)
-    if path.exists() and not force:
-        raise UsageError(f"{path}: exists already; --force replaces it")
+    refuse_replacing(path, force)
     if not kind:
         refuse_broken_link(path)
     check_replaced(path, ("[0-9]*.png",))

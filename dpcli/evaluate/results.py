@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.text_tables import TextTable
 from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
 
 _NAMES_IN_NOTE = 10
+Statistics, Measured = TypeVar("Statistics"), TypeVar("Measured")
 
 
 @dataclass
@@ -38,6 +40,38 @@ class Result:
     tables: list[TextTable] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     incomplete: str = ""
+
+
+def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
+    """Returns the statistics of all parts together: arrays one after the other, numbers summed. Raises DataError without parts."""
+    parts = list(parts)
+    if not parts:
+        raise DataError("no statistics to merge: nothing was evaluated")
+    columns = {own.name: [getattr(part, own.name) for part in parts] for own in fields(parts[0])}
+    return type(parts[0])(
+        **{key: np.concatenate(rows) if isinstance(rows[0], np.ndarray) else sum(rows) for key, rows in columns.items()}
+    )
+
+
+def measure_by_class(
+    labels: Sequence[int], rows: Sequence[Statistics], measure: Callable[[list[Statistics]], Measured]
+) -> dict[int, Measured]:
+    """Returns what `measure` makes of the samples of each label that occurs; those without a label (-1) are in none.
+
+    >>> measure_by_class([2, 0, -1, 2], [10, 20, 30, 40], sum)
+    {0: 20, 2: 50}
+    """
+    return {
+        label: measure([row for own, row in zip(labels, rows, strict=True) if own == label])
+        for label in sorted({label for label in labels if label >= 0})
+    }
+
+
+def class_rows_json(rows: Mapping[int, dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Returns the values of each label as an object for `--json`, with the label and its name, "" where it has none."""
+    return [
+        {"label": label, "name": names[label] if label < len(names) else "", **values} for label, values in rows.items()
+    ]
 
 
 def counted_split(split: str | None, splits: Sequence[str]) -> str:

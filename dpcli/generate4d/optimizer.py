@@ -268,9 +268,7 @@ class SceneOptimizer:
     def _clamp_gaussians(self) -> None:
         """Keeps sizes within what a picture can tell and colors within what it can show."""
         sizes = self.model.gaussians.log_scale.clamp_(math.log(_SMALLEST), math.log(_LARGEST))
-        if (
-            self.regularize
-        ):  # a needle along the line of sight is invisible in the one picture, a splinter in all others
+        if self.regularize:  # a needle along the line of sight is unseen in the one picture, a splinter in all others
             torch.minimum(sizes, sizes.mean(1, keepdim=True) + math.log(self.config.aspect), out=sizes)
         self.model.gaussians.color.clamp_(0.0, 1.0)
 

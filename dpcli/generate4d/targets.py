@@ -56,9 +56,13 @@ class Targets:
         return int(self.pictures[..., 3].float().sum((0, 2, 3)).argmax())
 
     def at(self, views: list[int], frames: list[int], shrink: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size."""
+        """Returns pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size.
+
+        They keep at least two pixels each way, as few as a slope needs.
+        """
         chosen = self.pictures[views, frames].float()
         matrices = torch.from_numpy(self.intrinsics[views]).float()
+        shrink = min(shrink, min(self.size) // 2)
         if shrink > 1:
             chosen = torch.nn.functional.avg_pool2d(chosen.permute(0, 3, 1, 2), shrink).permute(0, 2, 3, 1).contiguous()
             matrices = matrices.clone()
@@ -75,13 +79,18 @@ class Targets:
 def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
     """Returns the reference view and those of these roles, resized to a longer side of `size` pixels (never enlarged).
 
-    Raises DataError when the reference view is empty in every frame.
+    Raises DataError when the reference view is empty in every frame, and for pictures that are a single row or column then.
     """
     with ViewsReader(path) as reader:
         header = reader.header
         chosen = [view for view, role in enumerate(header.role) if role in roles or view == header.reference]
         scale = min(1.0, size / max(header.size))
         width, height = (max(int(round(side * scale)), 1) for side in header.size)
+        if min(width, height) < 2:
+            raise DataError(
+                f"{path}: pictures of {header.size[0]} x {header.size[1]} pixels, {width} x {height} at --size {size}, are too"
+                " narrow; expected at least 2 each way, give a larger --size or prepare the clip again"
+            )
         pictures = torch.empty(len(chosen), reader.num_frames, height, width, 4, dtype=torch.float16)
         for row, view in enumerate(chosen):
             for frame in range(reader.num_frames):

@@ -97,10 +97,8 @@ class Report:
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
     """Returns everything that decides the file's content, except the seed: equal ones may continue each other."""
-    digest, fingerprint = (
-        hashlib.sha256("\n".join(reader.class_names).encode()),
-        cache(_fingerprint),
-    )  # items may share a folder
+    digest = hashlib.sha256("\n".join(reader.class_names).encode())
+    fingerprint = cache(_fingerprint)  # items may share a folder
     for item in items:
         facts = (item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path))
         digest.update("\n".join(map(str, facts)).encode())
@@ -121,7 +119,9 @@ def _fingerprint(path: Path) -> str:
         if not path.is_dir():
             return str(path.stat().st_size)
         names = sorted(
-            name for name in os.listdir(path) if not name.startswith(".") and not name.endswith((".h5", ".hdf5"))
+            name
+            for name in os.listdir(path)
+            if not name.startswith(".") and not name.lower().endswith((".h5", ".hdf5"))
         )
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"

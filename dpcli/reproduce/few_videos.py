@@ -20,7 +20,7 @@ import torch
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.explain.tsne import joined_features, video_features
 from dpcli.classify.network.model_file import load_model
-from dpcli.reproduce.runs import Cell, cut, dpc, markdown, once, write_text
+from dpcli.reproduce.runs import Cell, cut, digest, dpc, markdown, once, write_text
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader, CloudsWriter
 
@@ -72,7 +72,7 @@ def row(clouds: Path, folder: Path, model: Path | str, words: list[str], seed: i
     scored = ("--clips-per-video", str(_CLIPS))
     tuned = ("--init", model, "--validation", "none", "--seed", seed)
     alone = (*words, "--validation", "none", "--seed", seed)
-    near = once(folder / "nearest.json", [str(model), clouds.name, seed], lambda: nearest(model, clouds, seed))
+    near = once(folder / "nearest.json", [str(model), digest(clouds), seed], lambda: nearest(model, clouds, seed))
     forest = json.loads(dpc("classify", "baseline", clouds, "--json", "--seed", seed))
     return [
         cell_accuracy(Cell(folder / "tuned", clouds, tuned, scored)),
@@ -95,6 +95,9 @@ def main(words: list[str] | None = None) -> None:
     given = parser.parse_args(own)
     if not given.clouds.is_file():
         parser.error(f"{given.clouds}: no such file; expected clouds, such as `dpc prepare msraction3d` makes")
+    numbers = given.videos.split(",")
+    if not all(one == "all" or one.isdecimal() and int(one) for one in numbers):
+        parser.error(f"--videos {given.videos}: expected numbers from 1 and all, such as 5,10,all")
     given.folder.mkdir(parents=True, exist_ok=True)
     with CloudsReader(given.clouds) as reader:
         count = len(reader.class_names)
@@ -105,7 +108,7 @@ def main(words: list[str] | None = None) -> None:
         base.run(dpc)
         model = base.model
     rows = []
-    for videos in given.videos.split(","):
+    for videos in numbers:
         cells = given.folder / videos
         cells.mkdir(exist_ok=True)
         new = list(range(given.known, count))

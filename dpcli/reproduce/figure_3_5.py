@@ -34,6 +34,7 @@ from dpcli.reproduce.runs import (
     numbers,
     once,
     override,
+    sweeps,
     write_json,
     write_text,
 )
@@ -249,18 +250,7 @@ def make(
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
     """Returns the values of each sweep: `group_size=2,4` replaces a sweep's own, `group_size=` leaves it out."""
-    values = {key: sweep.values for key, sweep in SWEEPS.items()}
-    for option in options:
-        key, _, text = option.partition("=")
-        try:
-            numbers = tuple(float(word) for word in text.split(",") if word)
-        except ValueError:
-            numbers = ()
-            key = ""
-        if key not in SWEEPS:
-            print(f"--sweep {option}: expected NAME=1,2,... with one of {', '.join(SWEEPS)}", file=sys.stderr)
-            sys.exit(2)
-        values[key] = numbers
+    values = {key: sweep.values for key, sweep in SWEEPS.items()} | sweeps(options, SWEEPS)
     return {key: own for key, own in values.items() if own}
 
 

@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
@@ -199,6 +199,21 @@ def numbers(text: str) -> list[int]:
     except ValueError:
         print(f"{text!r}: expected whole numbers such as 0,1,2", file=sys.stderr)
         sys.exit(2)
+
+
+def sweeps(options: Sequence[str], known: Iterable[str], least: int = 0) -> dict[str, tuple[float, ...]]:
+    """Returns the numbers, `least` or more, of options such as `group_size=2,4`; ends the program with a sentence for others."""
+    values = {}
+    for option in options:
+        name, _, text = option.partition("=")
+        try:
+            values[name] = tuple(float(word) for word in text.split(",") if word)
+        except ValueError:
+            name = ""
+        if name not in known or len(values[name]) < least:
+            print(f"--sweep {option}: expected NAME=1,2,... with one of {', '.join(known)}", file=sys.stderr)
+            sys.exit(2)
+    return values
 
 
 def shares(found: Sequence[dict], stream: str) -> list[float]:

@@ -14,7 +14,7 @@ import json
 import sys
 from pathlib import Path
 
-from dpcli.reproduce.runs import cut, dpc, thesis_rows
+from dpcli.reproduce.runs import DASH, cut, dpc, thesis_rows, write_text
 
 METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 _BOTH = ("--set", "consensus=none", "--set", "motion_head=false")
@@ -49,7 +49,7 @@ def table(found: dict[str, dict], about: str) -> str:
     for (key, (name, _)), row in zip(ROWS.items(), thesis_rows("4.1"), strict=True):
         own = found.get(key, {})
         cells = (
-            f" {theirs:.1f} / {'–' if own.get(metric) is None else format(100 * own[metric], '.1f')} "
+            f" {theirs:.1f} / {DASH if own.get(metric) is None else format(100 * own[metric], '.1f')} "
             for metric, theirs in zip(METRICS, row["values"], strict=True)
         )
         lines.append(f"| {name} |" + "|".join(cells) + "|")
@@ -79,7 +79,7 @@ def main(argv: list[str] | None = None) -> None:
     for key in sorted(chosen if _FIRST in chosen else [_FIRST, *chosen], key=lambda key: key != _FIRST):
         print(f"table 4.1: {ROWS[key][0]}", file=sys.stderr)
         found[key] = run_row(key, options.train, options.test, options.folder, budget, options.protocol, options.split)
-        target.write_text(table(found, about))
+        write_text(target, table(found, about))
     print(target.read_text(), end="")
 
 

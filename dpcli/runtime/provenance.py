@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -12,7 +13,8 @@ from dpcli.runtime.whole_file import refuse_folder
 
 # Options that change how the work runs but not its result: left out, so that equal work gives equal bytes.
 _VALUED = {"-o", "--output", "--jobs", "--shard", "--dask", "--picture", "--animation", "--device", "--log", "--report"}
-_FLAGS = {"-q", "--quiet", "-v", "--verbose", "--debug", "--force", "--json"}
+_FLAGS = {"--quiet", "--verbose", "--debug", "--force", "--json"}
+_SHORT = re.compile(r"-[qv]+|-o.+")  # several letters, or the file, behind one dash
 
 
 def command_line(argv: list[str] | None = None) -> str:
@@ -23,7 +25,7 @@ def command_line(argv: list[str] | None = None) -> str:
             skip = False
         elif word in _VALUED:
             skip = True
-        elif word not in _FLAGS and word.split("=")[0] not in _VALUED:
+        elif word not in _FLAGS and word.split("=")[0] not in _VALUED and not _SHORT.fullmatch(word):
             kept.append(word)
     return shlex.join(kept)
 

@@ -197,7 +197,7 @@ class RunFolder:
             torch.save({**state, "rows": self.rows}, file)
 
     def log(self, row: dict) -> None:
-        """Appends one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
+        """Appends one row and rewrites the small log files whole, so that a reader never sees half a line."""
         self.rows.append({key: row.get(key) for key in self.columns})
         _replace(self.path / "log.json", json.dumps(self.rows, indent=1))
         with whole_file(self.path / "log.csv") as part, open(part, "w", newline="") as file:

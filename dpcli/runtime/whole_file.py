@@ -150,6 +150,11 @@ def refuse_existing(path: str | Path, force: bool) -> None:
     """Raises, for an output that is one file, DataError where a folder is, UsageError where a file is and `force` is off."""
     if Path(path).is_dir():
         raise DataError(f"{path}: is a folder; name a file in it")
+    refuse_replacing(path, force)
+
+
+def refuse_replacing(path: str | Path, force: bool) -> None:
+    """Raises UsageError where an output, a file or a folder, exists and `force` is off."""
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
 

@@ -18,14 +18,17 @@ def sequences_of_split(reader: CloudsReader, split: str, name: str) -> list[int]
 def hold_out_sequences(reader: CloudsReader, validation: str, seed: int) -> tuple[list[int], list[int]]:
     """Returns the (training, validation) sequences of two frames or more.
 
-    Training: split `train`, or all when nothing is named so. validation: `auto`, the split `validation` if there is one,
-    else nothing; `none`; a fraction of the training sequences; class names with commas, held out whole. Raises DataError
-    where there is nothing to train on, UsageError for a fraction or class that can't be.
+    Training: split `train`, or what has no split when nothing is named so. validation: `auto`, the split `validation` if
+    there is one, else nothing; `none`; a fraction of the training sequences; class names with commas, held out whole.
+    Raises DataError where there is nothing to train on, UsageError for a fraction or class that can't be.
     """
     long = [i for i in range(len(reader)) if reader.frame_counts[i] >= 2]
     train = [i for i in long if reader.splits[i] == "train"] or [i for i in long if reader.splits[i] == ""]
     if not train:
-        raise DataError(f"{reader.path}: no sequence of split 'train' with two frames or more")
+        raise DataError(
+            f"{reader.path}: no sequence of split 'train', or without a split, has two frames or more; its splits are"
+            f" {', '.join(map(repr, sorted(set(reader.splits))))} (`dpc prepare split` makes others)"
+        )
     if validation in ("auto", "none"):
         held = [i for i in long if reader.splits[i] in ("validation", "val")] if validation == "auto" else []
         return train, held

@@ -1,19 +1,26 @@
 """The contract's data sets: name, type, shape and meaning of each, by kind of file.
 
 Writers take their types and shapes from here, `file.open_store` checks what it opens against it, and the tables of
-docs/format.md are made of it (`python -m dpcli.store.schema docs/format.md`). Imports only numpy.
+docs/format.md are made of it (`python -m dpcli.store.schema docs/format.md`). Imports no HDF5.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from dpcli.errors import UsageError
+
 SCHEMA = 1
 KEPT = "field_"  # what the name of a column begins with that was kept on request
+METERS = {  # in each unit of length that is known by the name that `length_unit` has for it
+    **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3},
+    **{"ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937},
+}
 _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
 
 
@@ -208,6 +215,18 @@ def kept_name(column: str) -> str:
     'field_v [m_s]'
     """
     return KEPT + column.replace("/", "_")
+
+
+def kept_names(columns: Sequence[str]) -> tuple[str, ...]:
+    """Returns the names of the data sets of these columns. Raises UsageError where two of them would be one data set."""
+    names = tuple(map(kept_name, columns))
+    for place, name in enumerate(names):
+        first = names.index(name)
+        if first < place:
+            raise UsageError(
+                f"--keep-fields: {columns[first]} and {columns[place]} would both be kept as {name}; keep one, or rename one"
+            )
+    return names
 
 
 def find_field(known: dict[str, Field], name: str) -> Field | None:

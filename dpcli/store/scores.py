@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -40,10 +41,14 @@ class ScoresWriter(ResumableWriter):
     def __init__(self, path: str | Path, *, streams: Sequence[str] = (), rejects: bool = False, **options: Any) -> None:
         self.streams, self.rejects = tuple(streams), rejects
         self._names: list[str] = []
+        self._known: set[str] = set()  # the same, to find one again
         self._splits: list[str] = []
         self._labels = array("i")
         self._rejected = array("B")
         self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
+        _check_classes(path, options.get("class_names", ()))
+        if wrong := [name for name in self.streams if not name or "/" in name or name == "."]:
+            raise DataError(f"{path}: a stream called {wrong[0]!r}; HDF5 needs a name without a slash")
         super().__init__(path, **options)
 
     def write(
@@ -58,9 +63,16 @@ class ScoresWriter(ResumableWriter):
     ) -> None:
         """Adds one sample: scores f32 (C), and whether nothing was recognized, which a file that `rejects` keeps.
 
-        Raises DataError unless scores are finite and as many as there are classes.
+        Raises DataError unless scores are finite and as many as there are classes, the label is one of these or -1, and
+        the name is new.
         """
         own = streams or {}
+        if name in self._known:
+            raise DataError(f"sample {name!r}: the name appears twice; names identify samples")
+        if not -1 <= label < len(self.class_names):
+            raise DataError(
+                f"sample {name!r}: label {label}, expected -1 (unknown) or 0 to {len(self.class_names) - 1}"
+            )
         for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():
                 raise DataError(
@@ -71,6 +83,7 @@ class ScoresWriter(ResumableWriter):
         main, *single = (
             np.asarray(row, _FIELD["scores"].dtype) for row in (scores, *(own[key] for key in self.streams))
         )
+        self._known.add(name)
         self._names.append(name)
         self._splits.append(split)
         self._labels.append(int(label))
@@ -159,11 +172,7 @@ class ScoresReader:
             raise DataError(f"{self.path}: rejected has shape {self.rejected.shape}, expected {shape[:1]}")
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
-        twice = sorted({name for name in self.class_names if name and self.class_names.count(name) > 1})
-        if twice:
-            raise DataError(
-                f"{self.path}: {len(twice)} class names repeat, such as {twice[0]!r}; each class needs a name of its own"
-            )
+        _check_classes(self.path, self.class_names)
         if len(set(self.names)) != len(self.names):
             raise DataError(f"{self.path}: sample names repeat; names identify samples")
         if len(self.labels) and (self.labels.min() < -1 or self.labels.max() >= shape[1]):
@@ -171,3 +180,12 @@ class ScoresReader:
             raise DataError(
                 f"{self.path}: label {self.labels[row]} of {self.names[row]!r}; expected -1..{shape[1] - 1}"
             )
+
+
+def _check_classes(path: str | Path, class_names: Sequence[str]) -> None:
+    """Raises DataError where two classes have one name; several may have none."""
+    twice = sorted(name for name, count in Counter(class_names).items() if name and count > 1)
+    if twice:
+        raise DataError(
+            f"{path}: {len(twice)} class names repeat, such as {twice[0]!r}; each class needs a name of its own"
+        )

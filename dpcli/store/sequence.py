@@ -152,11 +152,9 @@ class CloudSequence:
             if isinstance(value, str) and "\0" in value:
                 raise DataError(f"sample {self.name!r}: {one.name} {value!r} holds NUL, expected a text")
             if value is not None and not isinstance(value, str):
-                limits = np.iinfo(one.dtype)
-                if not limits.min <= value <= limits.max:
-                    raise DataError(
-                        f"sample {self.name!r}: {one.name} {value} is too large, expected at most {limits.max}"
-                    )
+                most = np.iinfo(one.dtype).max
+                if not -1 <= value <= most:
+                    raise DataError(f"sample {self.name!r}: {one.name} {value}, expected -1 (unknown) or 0 to {most}")
 
     def _validate_fields(self, where: str) -> None:
         for key, (dtype, shape) in POINT_FIELDS.items():

@@ -22,19 +22,9 @@ from dpcli.evaluate.bootstrap import (
     two_sided_p,
 )
 from dpcli.evaluate.classification.metrics import classification_metrics, classification_weighted
-from dpcli.evaluate.segmentation.metrics import (
-    SegmentationStatistics,
-    segmentation_compute,
-    segmentation_merge,
-    segmentation_weighted,
-)
-from dpcli.evaluate.segmentation.motion_metrics import (
-    TAUS,
-    MotionStatistics,
-    motion_compute,
-    motion_merge,
-    motion_weighted,
-)
+from dpcli.evaluate.results import merge_statistics
+from dpcli.evaluate.segmentation.metrics import SegmentationStatistics, segmentation_compute, segmentation_weighted
+from dpcli.evaluate.segmentation.motion_metrics import TAUS, MotionStatistics, motion_compute, motion_weighted
 from dpcli.runtime.seeds import generator
 from dpcli.store import ScoresWriter
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
@@ -202,7 +192,7 @@ def test_segmentation_of_resamples(protocol, ties, block, monkeypatch):
     counts = counts_of(12)
     found = segmentation_weighted(objects, protocol)(counts)
     for number, row in enumerate(counts):
-        expected = segmentation_compute(segmentation_merge([objects[i] for i in repeated(row)]), protocol)
+        expected = segmentation_compute(merge_statistics([objects[i] for i in repeated(row)]), protocol)
         for key, values in found.items():
             if protocol == "release" and key == "ap" and ties:
                 continue  # copies of a sequence apart in the file: ties in another order
@@ -234,7 +224,7 @@ def test_motion_of_resamples(batch):
     objects, counts = random_motions(9), counts_of(9)
     found = motion_weighted(objects, 0.05, batch)(counts)
     for number, row in enumerate(counts):
-        expected = motion_compute(motion_merge([objects[i] for i in repeated(row)]), batch)
+        expected = motion_compute(merge_statistics([objects[i] for i in repeated(row)]), batch)
         own = {
             "epe3d": expected.epe3d,
             "epe3d_no_motion": expected.still,
@@ -261,7 +251,7 @@ def test_replicates_of_a_metric_that_is_no_ratio_spread_like_a_brute_resampling(
     fast = replicates(segmentation_weighted(objects), 30, np.random.default_rng(0), 400)["ap"]
     rng = np.random.default_rng(0)
     slow = [
-        segmentation_compute(segmentation_merge([objects[i] for i in rng.integers(0, 30, 30)])).ap for _ in range(400)
+        segmentation_compute(merge_statistics([objects[i] for i in rng.integers(0, 30, 30)])).ap for _ in range(400)
     ]
     assert fast == pytest.approx(slow, abs=1e-12)  # the same stream of draws
 

@@ -202,6 +202,36 @@ def test_a_fit_that_runs_away_is_told(setting, tmp_path, dpc_here):
         assert np.isfinite(read_scene(out).frame_mean).all()
 
 
+def test_coarse_steps_shrink_a_picture_to_two_pixels_at_most(tmp_path, dpc_here):
+    views, small = toy_views(tmp_path / "toy.h5"), ("--preset", "tiny", "--prior", "none", "--size", 16, *steps(2, 1))
+    done = dpc_here("generate4d", "fit", views, "-o", tmp_path / "s.h5", *small, "--set", "coarse=0.5,100")
+    assert done.returncode == 0, done.stderr
+
+
+def narrow_views(path: Path, width: int, height: int) -> Path:
+    header = ViewsHeader(
+        "n",
+        pinhole(0.85, width, height)[None],
+        orbit_pose(0.0, 0.0)[None],
+        np.arange(2.0),
+        ["reference"],
+        0,
+        (width, height),
+    )
+    with ViewsWriter(path, header) as writer:
+        for frame in range(2):
+            writer.add(0, frame, np.full((height, width, 4), 255, np.uint8))
+    return path
+
+
+def test_narrow_pictures_are_fitted_and_those_of_one_row_refused(tmp_path, dpc_here):
+    words = ("--preset", "tiny", "--prior", "inflated", "--size", 300, *steps(1, 1))
+    done = dpc_here("generate4d", "fit", narrow_views(tmp_path / "a.h5", 300, 3), "-o", tmp_path / "s.h5", *words)
+    assert done.returncode == 0, done.stderr
+    done = dpc_here("generate4d", "fit", narrow_views(tmp_path / "b.h5", 1000, 3), "-o", tmp_path / "t.h5", *words)
+    assert done.returncode == 3 and b"1000 x 3 pixels, 300 x 1 at --size 300, are too narrow" in done.stderr
+
+
 def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     from dpcli.generate4d.fit import COLUMNS
     from dpcli.runtime.run_folder import RunFolder

@@ -179,6 +179,8 @@ def test_equal_weights_are_equal_bytes(tmp_path):
 def test_the_recorded_command_leaves_out_what_doesn_t_change_the_result():
     words = ["prepare", "depth", "my video", "-o", "x.h5", "--jobs", "4", "--seed", "0", "-q", "--output=y", "--force"]
     assert provenance.command_line(words) == "dpc prepare depth 'my video' --seed 0"
+    joined = ["-qv", "prepare", "depth", "-oa.h5", "--output=b.h5", "--scale", "-1"]
+    assert provenance.command_line(joined) == "dpc prepare depth --scale -1"
 
 
 def test_generators_depend_on_every_key():

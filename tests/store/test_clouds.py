@@ -146,6 +146,8 @@ def _bad(sequence: CloudSequence, **changes) -> CloudSequence:
         (lambda s: _bad(s, points=np.full_like(s.points, 3e37)), r"a number beyond 1e\+12"),
         (lambda s: _bad(s, points=np.full_like(s.points, np.nan)), "NaN or infinite"),
         (lambda s: _bad(s, label=3), "out of range; expected -1 .unknown. or 0..2"),
+        (lambda s: _bad(s, subject=-2), "subject -2, expected -1 .unknown. or 0 to"),
+        (lambda s: _bad(s, camera=2**40), "camera 1099511627776, expected -1"),
         (lambda s: _bad(s, frame_offsets=s.frame_offsets[::-1]), "frame_offsets must rise"),
         (lambda s: _bad(s, points=s.points[:, :2]), "expected .points, 3"),
         (lambda s: _bad(s, part=np.zeros(1, np.int16)), "part is int16"),

@@ -43,6 +43,18 @@ def test_bad_rows_are_refused(tmp_path):
         ScoresWriter(tmp_path / "s.h5", class_names=["a"], streams=("x",)) as writer,
     ):
         writer.write("v", np.array([1.0]))
+    for told, names, labels in (
+        ("label 2, expected -1 .unknown. or 0 to 1", "vw", (0, 2)),
+        ("label -2", "vw", (-1, -2)),
+        ("'v': the name appears twice", "vv", (0, 1)),
+    ):
+        with pytest.raises(DataError, match=told), ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer:
+            for name, label in zip(names, labels):
+                writer.write(name, np.ones(2), label=label)
+    with pytest.raises(DataError, match="1 class names repeat, such as 'a'"):
+        ScoresWriter(tmp_path / "s.h5", class_names=["a", "b", "a"])
+    with pytest.raises(DataError, match="a stream called 'a/b'"):
+        ScoresWriter(tmp_path / "s.h5", class_names=["a"], streams=("a/b",))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""Put a page together from its template, styles, scripts and data, and write it whole."""
+"""A page put together from its template, styles, scripts and data, and written whole."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _spelled(value: Any) -> Any:
 
 
 def as_base64(data: bytes) -> str:
-    """Compress (deflate) and spell bytes as base64; `unpacked` of base.js reverses it. Equal bytes give equal text."""
+    """Returns bytes, compressed (deflate), as base64; `unpacked` of base.js reverses it. Equal bytes give equal text."""
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
 
 

@@ -11,11 +11,8 @@ from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts
 
 MOST_ROWS = 5000
-_BEST, _DIGITS, _ONE = (
-    5,
-    4,
-    1e-3,
-)  # classes told of a sample; digits of a score; how far a sum of probabilities may be from 1
+_BEST, _DIGITS = 5, 4  # classes shown of a sample; digits of a score
+_ONE = 1e-3  # how far a sum of probabilities may be from 1
 
 
 def scores_page(

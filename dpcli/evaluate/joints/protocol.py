@@ -13,7 +13,7 @@ from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric, ratio
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
 from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
 from dpcli.evaluate.proportions import divide
-from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.results import LeftOut, measure_by_class
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences
 from dpcli.store import CloudSequence, CloudsReader
 
@@ -81,10 +81,7 @@ def evaluate_joints(
     total = sum(found, JointStatistics())
     if not total.joints:
         raise DataError(f"{truth}: no joint between two parts that are seen; nothing to compare")
-    counts = {
-        label: sum((one for own, one in zip(labels, found) if own == label), JointStatistics())
-        for label in sorted({label for label in labels if label >= 0})
-    }
+    counts = measure_by_class(labels, found, lambda own: sum(own, JointStatistics()))
     return JointReport(
         paired.split,
         str(truth),

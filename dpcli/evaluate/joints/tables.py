@@ -8,8 +8,15 @@ from typing import Any
 from dpcli.evaluate.joints.metrics import JointStatistics
 from dpcli.evaluate.joints.protocol import METRICS, JointReport
 from dpcli.evaluate.joints.visibility import VISIBLE
-from dpcli.evaluate.results import intervals_json, left_out_json, left_out_note, none_if_nan, samples_json
-from dpcli.evaluate.segmentation.tables import class_rows
+from dpcli.evaluate.results import (
+    class_rows_json,
+    intervals_json,
+    left_out_json,
+    left_out_note,
+    none_if_nan,
+    samples_json,
+)
+from dpcli.evaluate.segmentation.tables import class_rows, interval_tables
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
 
 _SHARES = ("type", "axis_within_5", "visible_type", "visible_axis_within_5", "edge_f1")
@@ -45,8 +52,6 @@ def joint_tables(report: JointReport) -> list[TextTable]:
         for title, (metrics, counts) in class_rows((report.metrics, report.total), pairs, report.class_names)
     ]
     main = TextTable("Joints", ["class", "true joints", *(titles[key] for key in METRICS)], rows)
-    if not report.intervals:
-        return [main]
     ends = [
         [
             titles[key],
@@ -55,8 +60,7 @@ def joint_tables(report: JointReport) -> list[TextTable]:
         ]
         for key in METRICS
     ]
-    title = f"{100 * report.resampling.confidence:.4g} % interval"
-    return [main, TextTable("All sequences", ["metric", "value", title], ends)]
+    return [main, *interval_tables(report, ends)]
 
 
 def _shown(key: str, value: float) -> str:
@@ -84,15 +88,7 @@ def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()
     source: the parts file, as it was named. provenance: that of the file.
     """
     unit = report.length_unit
-    rows = [
-        {
-            "label": label,
-            "name": report.class_names[label] if label < len(report.class_names) else "",
-            **_numbers(metrics),
-            **_counts(report.counts[label]),
-        }
-        for label, metrics in report.classes.items()
-    ]
+    rows = {label: _numbers(own) | _counts(report.counts[label]) for label, own in report.classes.items()}
     units = {**dict.fromkeys(_SHARES, "fraction"), "axis_angle": "degree", "axis_position": unit}
     return {
         "task": "joints",
@@ -104,7 +100,7 @@ def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()
             "axis_within": 5,
             "visible": VISIBLE,
         },
-        "metrics": _numbers(report.metrics) | {"per_class": rows},
+        "metrics": _numbers(report.metrics) | {"per_class": class_rows_json(rows, report.class_names)},
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
         "units": units | {"state_angle": "degree", "state_length": unit},

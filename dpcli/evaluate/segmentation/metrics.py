@@ -7,7 +7,7 @@ take panoptic quality, F1, precision and recall from `part_scores`, and average 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
 from dpcli.evaluate.choices import PARTS_PROTOCOLS
 from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.average_precision import RankedPredictions, average_precision
 from dpcli.evaluate.segmentation.part_matching import FrameMatch, match_parts, mean_iou
 from dpcli.evaluate.segmentation.rand_index import rand_index
@@ -54,7 +55,7 @@ class SegmentationStatistics:
 
     def __add__(self, other: SegmentationStatistics) -> SegmentationStatistics:
         """Returns the statistics of both sets of objects together."""
-        return segmentation_merge([self, other])
+        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)
@@ -121,17 +122,6 @@ def _is_release(protocol: str) -> bool:
     if protocol not in PARTS_PROTOCOLS:
         raise ValueError(f"protocol {protocol!r}: expected one of {', '.join(PARTS_PROTOCOLS)}")
     return protocol == "release"
-
-
-def segmentation_merge(parts: Iterable[SegmentationStatistics]) -> SegmentationStatistics:
-    """Returns the statistics of all parts together, equal to those of all objects at once. Raises DataError without parts."""
-    parts = list(parts)
-    if not parts:
-        raise DataError("no statistics to merge: evaluate at least one sequence")
-    columns = {own.name: [getattr(part, own.name) for part in parts] for own in fields(SegmentationStatistics)}
-    return SegmentationStatistics(
-        **{key: np.concatenate(rows) if isinstance(rows[0], np.ndarray) else sum(rows) for key, rows in columns.items()}
-    )
 
 
 def panoptic_quality(
@@ -208,7 +198,7 @@ def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol:
 
     sequences: the statistics of each one. Raises ValueError for an unknown protocol.
     """
-    whole = segmentation_merge(sequences)
+    whole = merge_statistics(sequences)
     sequence = np.repeat(np.arange(len(sequences)), [len(one.iou) for one in sequences])
     hits, predictions, iou = (
         np.bincount(sequence, weights, len(sequences)) for weights in (whole.matched, None, whole.iou * whole.matched)

@@ -6,14 +6,15 @@ both take end-point error, AccS, AccR and Outlier as means of the same sums (`_f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import WeightedMetric, ratios_of_sums
 from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.part_matching import hungarian_matching
 from dpcli.evaluate.segmentation.part_overlap import overlap
 from dpcli.evaluate.segmentation.rigid_motion import rotation_angle
@@ -47,7 +48,7 @@ class MotionStatistics:
 
     def __add__(self, other: MotionStatistics) -> MotionStatistics:
         """Returns the statistics of both sets of pairs together."""
-        return motion_merge([self, other])
+        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)
@@ -161,17 +162,6 @@ def part_motion_update(
     )
 
 
-def motion_merge(parts: Iterable[MotionStatistics]) -> MotionStatistics:
-    """Returns the statistics of all parts together, equal to those of all pairs at once. Raises DataError without parts."""
-    parts = list(parts)
-    if not parts:
-        raise DataError("no statistics to merge: evaluate at least one frame pair")
-    columns = {own.name: [getattr(part, own.name) for part in parts] for own in fields(MotionStatistics)}
-    return MotionStatistics(
-        **{key: np.concatenate(rows) if isinstance(rows[0], np.ndarray) else sum(rows) for key, rows in columns.items()}
-    )
-
-
 def flow_keys(tau: float) -> list[tuple[str, int, int]]:
     """Returns (metric, row, column of `hits`) of AccS, AccR, Outlier; those of the protocol's own `tau` without a number.
 
@@ -256,7 +246,7 @@ def _in_batches(
     """Returns flow metrics by recomputation: a batch of successive pairs spans sequences, so no sum over these gives them."""
     lengths = np.array([len(one.points) for one in sequences])
     points = np.concatenate([one.points for one in sequences])
-    sums = _flow_sums(motion_merge(sequences), tau)
+    sums = _flow_sums(merge_statistics(sequences), tau)
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
         resamples = [_rows_of_pairs(lengths, row) for row in counts.astype(np.int64)]

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import (
     MAIN_TAU,
     RELEASE_BATCH,
@@ -21,7 +21,6 @@ from dpcli.evaluate.segmentation.motion_metrics import (
     MotionStatistics,
     flow_update,
     motion_compute,
-    motion_merge,
     motion_weighted,
     part_motion_update,
 )
@@ -104,8 +103,10 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
         counted.about["split"],
         counted.about["truth"],
         counted.length_unit,
-        motion_compute(motion_merge(statistics), batch),
-        _metrics_by_class([row["label"] for _, row in found], statistics, batch),
+        motion_compute(merge_statistics(statistics), batch),
+        measure_by_class(
+            [row["label"] for _, row in found], statistics, lambda own: motion_compute(merge_statistics(own), batch)
+        ),
         counted.class_names,
         [*counted.left_out, *([LeftOut(reason, without_pairs)] if without_pairs else [])],
         len(statistics),
@@ -138,16 +139,6 @@ def _check_found(statistics: list[MotionStatistics], without_truth: int, path: s
     raise DataError(f"{path}: nothing to compare: {why}")
 
 
-def _metrics_by_class(
-    labels: list[int], statistics: list[MotionStatistics], batch: int | None
-) -> dict[int, MotionMetrics]:
-    rows = list(zip(labels, statistics, strict=True))
-    return {
-        label: motion_compute(motion_merge(one for own, one in rows if own == label), batch)
-        for label in sorted({label for label in labels if label >= 0})
-    }
-
-
 def _only_next_frames(pair: SequencePair) -> SequencePair:
     """Returns the sequence with only what is predicted of pairs f -> f + 1."""
     parts = pair.parts
@@ -158,7 +149,7 @@ def _only_next_frames(pair: SequencePair) -> SequencePair:
 
 def _sequence_statistics(pair: SequencePair, truth: Path) -> MotionStatistics:
     try:
-        return motion_merge(_compare_with_poses(pair) if pair.truth.pose is not None else _compare_with_flow(pair))
+        return merge_statistics(_compare_with_poses(pair) if pair.truth.pose is not None else _compare_with_flow(pair))
     except DataError as error:
         raise DataError(f"{truth}: {error}; make the file again") from None
 

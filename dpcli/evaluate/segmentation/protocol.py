@@ -13,13 +13,12 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
     SegmentationStatistics,
     segmentation_compute,
-    segmentation_merge,
     segmentation_update,
     segmentation_weighted,
 )
@@ -89,7 +88,7 @@ def _make_report(counted: Counted, resampling: Resampling) -> SegmentationReport
     about, labels = counted.about, [row["label"] for row in counted.rows]
     sequences = [SegmentationStatistics(**row["statistics"]) for row in counted.rows]
     protocol, ignore_below = about["protocol"], about["ignore_below"]
-    whole = segmentation_merge(sequences)
+    whole = merge_statistics(sequences)
     if whole.frames == 0:
         of_size = f" of at least {ignore_below} points" if ignore_below else ""
         raise DataError(f"{about['truth']}: not one frame has a true part{of_size}")
@@ -100,7 +99,7 @@ def _make_report(counted: Counted, resampling: Resampling) -> SegmentationReport
         about["truth"],
         segmentation_compute(whole, protocol),
         whole,
-        _metrics_by_class(labels, sequences, protocol),
+        measure_by_class(labels, sequences, lambda own: segmentation_compute(merge_statistics(own), protocol)),
         counted.class_names,
         counted.left_out,
         counted.names,
@@ -138,14 +137,3 @@ def compressed_over_pairs(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
         occurring = np.unique(np.concatenate([ids, partner]))
         made.append(np.where(ids >= 0, np.searchsorted(occurring[occurring >= 0], ids), -1))
     return made
-
-
-def _metrics_by_class(
-    labels: list[int], sequences: list[SegmentationStatistics], protocol: str
-) -> dict[int, SegmentationMetrics]:
-    return {
-        label: segmentation_compute(
-            segmentation_merge(one for own, one in zip(labels, sequences, strict=True) if own == label), protocol
-        )
-        for label in sorted({label for label in labels if label >= 0})
-    }

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from dpcli.evaluate.choices import SEGMENTATION_METRICS
-from dpcli.evaluate.results import intervals_json, left_out_json, none_if_nan, samples_json
+from dpcli.evaluate.results import class_rows_json, intervals_json, left_out_json, none_if_nan, samples_json
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
@@ -40,7 +40,7 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
             "ap_pq_f1_pre_rec": "pooled over all frames of all sequences",
             "miou_ri": "mean over the frames of a sequence, then over sequences",
         },
-        "metrics": segmentation_scores(report.main) | {"per_class": _class_rows(rows, report.class_names)},
+        "metrics": segmentation_scores(report.main) | {"per_class": class_rows_json(rows, report.class_names)},
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
         "units": dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
@@ -48,12 +48,6 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
         "left_out": left_out_json(report.left_out),
         "provenance": list(provenance),
     }
-
-
-def _class_rows(rows: Mapping[int, dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
-    return [
-        {"label": label, "name": names[label] if label < len(names) else "", **values} for label, values in rows.items()
-    ]
 
 
 def _segmentation_counts(metrics: SegmentationMetrics) -> dict[str, int]:
@@ -83,7 +77,7 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
         "task": "motion",
         "input": source,
         "protocol": _motion_protocol(report),
-        "metrics": _motion_numbers(report.main, tau) | {"per_class": _class_rows(rows, report.class_names)},
+        "metrics": _motion_numbers(report.main, tau) | {"per_class": class_rows_json(rows, report.class_names)},
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
         "units": {

@@ -8,7 +8,6 @@ from typing import Any
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
-from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import FIXES, SegmentationReport
 from dpcli.evaluate.segmentation.result_json import segmentation_scores
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
@@ -20,8 +19,8 @@ def class_rows(main: Any, classes: Mapping[int, Any], names: list[str]) -> list[
     return [*(named if len(named) > 1 else []), ("all", main)]
 
 
-def interval_tables(report: SegmentationReport | MotionReport, rows: list[list[str]]) -> list[TextTable]:
-    """Returns a table of (metric, value, interval) over all sequences, as a list of one; of none without intervals."""
+def interval_tables(report: Any, rows: list[list[str]]) -> list[TextTable]:
+    """Returns a table of (metric, value, interval) over all sequences, as a list of one; none for a report without intervals."""
     title = f"{100 * report.resampling.confidence:.4g} % interval"
     return [TextTable("All sequences", ["metric", "value", title], rows)] if report.intervals else []
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.results import LeftOut, merge_statistics
 from dpcli.evaluate.video.learned.base import LearnedMetric
-from dpcli.evaluate.video.picture_statistics import PictureMetrics, PictureStatistics, picture_compute, picture_merge
+from dpcli.evaluate.video.picture_statistics import PictureMetrics, PictureStatistics, picture_compute
 from dpcli.evaluate.video.protocol import VideoProtocol, check_size, scaled, score_frame
 from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.evaluate.video.sources.stored import SceneSource
@@ -64,7 +64,7 @@ class FramePass:
                 found = list(in_threads(self._frame_jobs(ours, theirs, count, damaged), progress))
                 if found:
                     view = self.truth.views[theirs]
-                    scores.append(ViewScore(view.title, view.role, picture_compute(picture_merge(found))))
+                    scores.append(ViewScore(view.title, view.role, picture_compute(merge_statistics(found))))
         self._refuse_damaged(damaged)
         self._check_plausible(scores, counts)
         return scores

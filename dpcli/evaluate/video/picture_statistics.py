@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video.psnr import psnr_of
 from dpcli.evaluate.video.ssim import multi_scale, similarity
 
@@ -36,7 +37,7 @@ class PictureStatistics:
 
     def __add__(self, other: PictureStatistics) -> PictureStatistics:
         """Returns the statistics of both sets of frames together."""
-        return picture_merge([self, other])
+        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)
@@ -101,14 +102,6 @@ def picture_update(
     )
     types = (np.int64, float, np.int64, float, np.int64, float, float, np.int64, float, np.int64, np.int64)
     return PictureStatistics(*(np.array([value], kind) for value, kind in zip(found, types, strict=True)))
-
-
-def picture_merge(parts: Iterable[PictureStatistics]) -> PictureStatistics:
-    """Returns the statistics of several sets of frames, one after the other. Raises ValueError for none."""
-    rows = [[getattr(part, f.name) for f in fields(PictureStatistics)] for part in parts]
-    if not rows:
-        raise ValueError("no statistics to merge")
-    return PictureStatistics(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
 def frame_psnr(found: PictureStatistics) -> np.ndarray:

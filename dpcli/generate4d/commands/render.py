@@ -68,7 +68,7 @@ def _lens(settings: RenderSettings) -> Lens:
 
 def _check_views(output: str | None, settings: RenderSettings, look: Look, *, has_sheet: bool) -> None:
     """Raises UsageError where `output` can't be the views file of --cameras, or has no use for a setting that was given."""
-    if output is None or (output != "-" and Path(output).suffix not in (".h5", ".hdf5")):
+    if output is None or (output != "-" and Path(output).suffix.lower() not in (".h5", ".hdf5")):
         raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
     unused = settings.changed("path", "frames", "fps")
     if not has_sheet:  # which has use for these

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
-from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, whole_file, write_whole
+from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, refuse_replacing, whole_file, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
@@ -60,11 +60,8 @@ def export_sequence(
     Players show a folder as a clip when it holds nothing but files of such names: see `tables_beside`. The folder appears
     whole. Raises UsageError when it exists and `force` is off, which would replace it.
     """
-    if folder.exists() and not force:
-        raise UsageError(f"{folder}: exists already; --force replaces it")
-    taken = [path for path in tables_beside(folder) if path.exists()]
-    if taken and not force:
-        raise UsageError(f"{taken[0]}: exists already; --force replaces it")
+    for path in (folder, *tables_beside(folder)):
+        refuse_replacing(path, force)
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
     check_replaced(folder, ("frame*.ply", "frame*.splat", "frame*.spz", "cameras.json", "metrics.json"))

@@ -7,6 +7,5 @@ from typing import Literal
 Format = Literal[
     "ply", "ply-sequence", "splat", "splat-sequence", "compressed.ply", "spz", "clouds", "cameras", "metrics"
 ]
-Axes = Literal[
-    "player", "keep"
-]  # as players take it: x right, y down, z forward (spz: y up, z back); or as in the scene, y up
+# as players take it: x right, y down, z forward (spz: y up, z back); or as in the scene, y up
+Axes = Literal["player", "keep"]

@@ -14,11 +14,8 @@ from dpcli.errors import DataError
 from dpcli.generate4d.out.splat_files import Splats
 from dpcli.runtime.whole_file import write_whole
 
-_FINE_BITS, _FINE_REACH, _COARSE_BITS = (
-    16,
-    120.0,
-    12,
-)  # of 24 bits a coordinate: steps of 1/65536 up to 128 units, or 1/4096
+_FINE_BITS, _COARSE_BITS = 16, 12  # of 24 a coordinate, behind the point: steps of 1/65536, or of 1/4096
+_FINE_REACH = 120.0  # units up to which the fine ones do, which end at 128
 
 
 def write_compressed_ply(path: Path, splats: Splats) -> None:

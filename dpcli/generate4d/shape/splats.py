@@ -11,11 +11,8 @@ from torch import Tensor
 from dpcli.generate4d.shape.layers import Camera, ShapeLayers, points_of
 from dpcli.ops.splatting.rasterization import rasterization
 
-_RADIUS, _THIN, _STEEPEST = (
-    0.35,
-    0.2,
-    8.0,
-)  # of a pixel's width; a disc on a steep slope is longer, at most so many times
+_RADIUS, _THIN = 0.35, 0.2  # of a pixel's width
+_STEEPEST = 8.0  # times that a disc on a steep slope is longer, at most
 _OPACITY = 0.95
 _INSIDE = 1.0  # of a pixel's width, from the outline's pixels to the discs that join front and back
 

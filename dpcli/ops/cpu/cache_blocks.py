@@ -33,9 +33,6 @@ def share_tasks(tasks: Sequence[Task], make_room: Callable[[], Room], work: Call
 
     There are as many threads as torch has, and the matrix products of each run on one thread: threads that shared each product
     would wait for each other several times a task, and longer than they work. No gradients are recorded.
-
-    As many threads as torch has, whose matrix products run on themselves alone: threads that shared each product would
-    wait for each other several times a piece, and longer than they work. No gradients are recorded.
     """
     threads, inference = torch.get_num_threads(), torch.is_inference_mode_enabled()
     waiting = iter(enumerate(tasks))

@@ -271,7 +271,7 @@ class NTU60:
         points = np.concatenate(clouds)
         points *= np.float32(1 / self.scale)
         time = (numbers[kept] - numbers[0]) / FPS
-        missing = int(numbers[-1] - len(numbers))
+        missing = int(numbers[-1] - np.count_nonzero(numbers))
         if missing:
             notes["frames missing in the numbering from 1"] = missing
         if others:

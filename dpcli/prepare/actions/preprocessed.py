@@ -110,7 +110,7 @@ class PeerClouds:
         root = require_folder(self.raw, f"one .npz per video of {self.form}")
         make: Callable[[Path], Item] = self._msr_item if self.form == "msraction3d" else self._ntu_item
         items: dict[str, Item] = {}
-        for path in (path for path in files_below(root) if path.suffix == ".npz"):
+        for path in (path for path in files_below(root) if path.suffix.lower() == ".npz"):
             item = make(path)
             if target := leads_out(path, root):
                 item = Item(item.name, path, problem=f"{path}: a link that leads out of the data, to {target}")

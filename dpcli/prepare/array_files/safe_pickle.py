@@ -17,9 +17,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.npy_files import read_member, require_room
 
-_CODE = re.compile(
-    r"[biufcSUO]\d{0,9}"
-)  # of an element: a number, text, or Python object, which is checked like all else
+# of an element: a number, text, or Python object, which is checked like all else
+_CODE = re.compile(r"[biufcSUO]\d{0,9}")
 _FLOATS = re.compile(rb"(?:G.{8}){0,1000}", re.DOTALL)  # a float's step and its bytes
 _CORES = ("numpy.core", "numpy._core")  # NumPy 1 and 2
 

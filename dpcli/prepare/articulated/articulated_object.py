@@ -289,11 +289,22 @@ def sampling_weights(obj: ArticulatedObject, part: np.ndarray, least: float) -> 
 def finite_limits(obj: ArticulatedObject) -> ArticulatedObject:
     """Gives slides without limits 0 to a quarter of the object's diameter, the other joints at their middles.
 
-    A slide of a thousand diameters has none either; those of more than ten are noted.
+    A slide of a thousand diameters has none either; those of more than ten are noted. One that follows another joint has
+    the range that this gives it.
     """
+    _limit_slides(obj)
+    for index, joint in enumerate(obj.joints):
+        if joint.follows >= 0 and not np.isfinite([joint.lower, joint.upper]).all():
+            lower, upper = sorted(_range(obj, joint))
+            obj.joints[index] = replace(joint, lower=lower, upper=upper)
+    return obj
+
+
+def _limit_slides(obj: ArticulatedObject) -> None:
+    """Gives limits to the slides without any that follow no other joint."""
     slides = [i for i, joint in enumerate(obj.joints) if joint.kind == "prismatic" and joint.follows < 0]
     if not slides or not len(obj.triangles):
-        return obj
+        return
     diameter = 2 * _radius(obj, set(slides))
     lengths = {i: obj.joints[i].upper - obj.joints[i].lower for i in slides}
     endless = {i for i, length in lengths.items() if not length <= _ENDLESS * diameter}
@@ -304,7 +315,6 @@ def finite_limits(obj: ArticulatedObject) -> ArticulatedObject:
     for index in endless:
         obj.joints[index] = replace(obj.joints[index], lower=0.0, upper=reach)
         obj.notes["slides without limits (a quarter of the object's size taken)"] += 1
-    return obj
 
 
 def _radius(obj: ArticulatedObject, closed: set[int]) -> float:

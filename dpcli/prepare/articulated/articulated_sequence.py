@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.ops.rotations import quaternion_to_matrix
 from dpcli.prepare.articulated.articulated_object import (
     ArticulatedObject,
     axis_rotation,
@@ -155,14 +156,8 @@ def global_motions(options: Articulation, rng: np.random.Generator) -> np.ndarra
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """Draws a rotation f64 (3,3), uniform over SO(3): a unit quaternion from a normal distribution."""
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    quaternion = rng.normal(size=4)
+    return quaternion_to_matrix(quaternion / np.linalg.norm(quaternion))
 
 
 def _frames(

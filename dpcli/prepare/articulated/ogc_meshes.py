@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.articulated.articulated_object import triangle_areas
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.meshes.mesh_files import load_mesh
@@ -51,7 +52,7 @@ def load_shape(path: Path, up: str) -> Shape:
     triangles = triangles.reshape(-1, 3, 3)
     if up == "z":  # a quarter turn about x: z -> y, y -> -z
         triangles = triangles[..., [0, 2, 1]] * [1, 1, -1]
-    if not len(triangles) or not np.isfinite(triangles).all() or not areas(triangles).sum() > 0:
+    if not len(triangles) or not np.isfinite(triangles).all() or not triangle_areas(triangles).sum() > 0:
         raise DataError(
             f"{path}: no surface (triangles: {len(triangles)}); expected a mesh of finite, non-empty triangles"
         )
@@ -59,11 +60,6 @@ def load_shape(path: Path, up: str) -> Shape:
     low, high = corners.min(0), corners.max(0)
     triangles = (triangles - (low + high) / 2) / (high - low).max()
     return Shape(triangles, spanning(triangles.reshape(-1, 3)))
-
-
-def areas(triangles: np.ndarray) -> np.ndarray:
-    """Returns the areas f64 (T) of triangles (T,3,3)."""
-    return 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
 
 
 def spanning(points: np.ndarray) -> np.ndarray:

@@ -11,12 +11,18 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.ops.open3d_import import load_open3d
+from dpcli.prepare.articulated.articulated_object import triangle_areas
 from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
-from dpcli.prepare.articulated.ogc_meshes import Shape, areas, find_meshes, load_shape
+from dpcli.prepare.articulated.ogc_meshes import Shape, find_meshes, load_shape
 from dpcli.prepare.meshes.raycast import pixel_rays
-from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface, points_on
+from dpcli.prepare.meshes.surface_points import (
+    SurfacePoints,
+    choose_on_surface,
+    first_hits,
+    points_on,
+    raycasting_scene,
+)
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.store import CloudSequence
 
@@ -122,7 +128,7 @@ class GeneratedRooms:
 
         placed = triangles @ poses[owner, :3, :3].transpose(0, 2, 1) + poses[owner, None, :3, 3]
         if self.options.view == "full":
-            chosen = choose_on_surface(areas(placed), max(_SURFACE, self.options.points), rng)
+            chosen = choose_on_surface(triangle_areas(placed), max(_SURFACE, self.options.points), rng)
         else:
             chosen = seen_by_camera(placed)
         points, part = points_on(placed, chosen).astype(np.float32), owner[chosen.triangle].astype(np.int16)
@@ -155,18 +161,7 @@ def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
     focal = height / 2 / half
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     rays = pixel_rays(intrinsics, pose, slice(0, height), slice(0, width), 1).reshape(-1, 6)
-    return _first_hits(triangles, rays)
-
-
-def _first_hits(triangles: np.ndarray, rays: np.ndarray) -> SurfacePoints:
-    open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
-    corners = open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32))
-    scene.add_triangles(corners, open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)))
-    hits = scene.cast_rays(open3d.core.Tensor(rays))
-    seen = np.flatnonzero(np.isfinite(hits["t_hit"].numpy()))
-    if not len(seen):
+    seen = first_hits(raycasting_scene(triangles), rays)
+    if not len(seen.triangle):
         raise DataError("the camera sees nothing of the room's objects; their surfaces are too thin")
-    uv = hits["primitive_uvs"].numpy()[seen].astype(np.float64)
-    weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], axis=1)
-    return SurfacePoints(hits["primitive_ids"].numpy()[seen].astype(np.int64), weights)
+    return seen

@@ -50,6 +50,10 @@ class SyntheticArticulated:
         for option in ("objects", "sequences_per_object"):
             if getattr(self, option) < 1:
                 raise UsageError(f"--{option.replace('_', '-')} {getattr(self, option)}: expected 1 or more")
+        if len(set(self.kinds)) < len(self.kinds):
+            raise UsageError(
+                f"--kinds {','.join(self.kinds)}: a kind is named twice; each is made as often as the others"
+            )
         unknown = sorted(set(self.kinds) - set(KINDS))
         if unknown:
             raise UsageError(f"--kinds {', '.join(unknown)}: not known; expected some of {', '.join(KINDS)}")

@@ -25,7 +25,7 @@ class Cloud:
     """Holds points f32 or f64 (N,3) as stored, NaN where the file has it.
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
-    coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
+    coordinates are in, as in `store.schema.METERS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
     names of those that points and colors came from. unread: the names of those that nobody asked for. dropped:
     counts of points that the file itself says don't count, by reason, and of what else it says and isn't used.
     """

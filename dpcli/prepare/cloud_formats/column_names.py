@@ -7,10 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from dpcli.errors import DataError
 
-UNITS = {  # meters
-    **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3},
-    **{"ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937},
-}
 _SPELLED = {
     **{word: "m" for word in ("m", "meter", "meters", "metre", "metres")},
     **{word: "mm" for word in ("mm", "millimeter", "millimeters", "millimetre", "millimetres")},
@@ -84,7 +80,7 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
 
 
 def unit_of(name: str) -> str:
-    """Returns the unit that a name ends with, as in UNITS, "" where it says none."""
+    """Returns the unit that a name ends with, as in `store.schema.METERS`, "" where it says none."""
     words = words_of(name)
     if re.search(r"[\[(]in[\])]$", name.strip()):  # without brackets a word like others
         return "in"

@@ -14,8 +14,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_points, without
-from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.cloud_formats.laz_chunks import check_chunks
+from dpcli.store.schema import METERS
 
 _COLORS = ("red", "green", "blue")
 WITHHELD = "points that their file marks as withheld dropped"
@@ -60,7 +60,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if not unit and _seem_degrees(las.header.scales, points):
         raise DataError(_in_degrees(path))
     if heights != unit:  # such as survey feet on the map and meters above sea
-        points[:, 2] *= UNITS[heights] / UNITS[unit]
+        points[:, 2] *= METERS[heights] / METERS[unit]
     cloud = Cloud(points, color, unit, extra, unread=unread, dropped=require_points(path, len(points), room))
     withheld = np.asarray(las["withheld"]).astype(bool)
     if withheld.any():

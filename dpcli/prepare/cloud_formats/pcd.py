@@ -132,9 +132,8 @@ def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.nd
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
         whole = kind.kind == "f" or (np.isfinite(column).all() and (column == np.floor(column)).all())
-        packed = (
-            name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()
-        )  # whole numbers, as some write them
+        # whole numbers, as some write them
+        packed = name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()
         columns[name] = column if packed or not whole else column.astype(kind)
     return columns, beyond
 

@@ -138,7 +138,7 @@ def split(
         said = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(choice).items()}
         inputs = {"clouds": path, **({"list": choice.listed} if choice.listed else {})}
         entry = record({"split": said, "compression": compression}, choice.seed, inputs)
-        if output.suffix in (".h5", ".hdf5"):
+        if output.suffix.lower() in (".h5", ".hdf5"):
             wanted = [name for name in counts if name]
             _write_split(reader, splits, wanted, _plan_copy(source, output, entry, compression, force))
             return counts

@@ -14,7 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
-from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
+from dpcli.prepare.cloud_formats.column_names import unit_of
 from dpcli.prepare.decode.calibration_texts import (
     MATLAB_ADVICE,
     mapping_of_bouguet,
@@ -23,6 +23,7 @@ from dpcli.prepare.decode.calibration_texts import (
     without_matlab_counting,
 )
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
+from dpcli.store.schema import METERS
 from dpcli.text_files import check_depth, parse_json
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
@@ -455,11 +456,11 @@ def _is_scale(key: str) -> bool:
 def _units_per_meter(path: Path, key: str, value: Any) -> float:
     """Returns the raw units per meter that a depth scale means. Its key may end with a unit, in which the value is then."""
     if isinstance(value, str) and (unit := unit_of(f"in {value}")):
-        return 1 / UNITS[unit]
+        return 1 / METERS[unit]
     if not _are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
     match = _SCALE.fullmatch(_letters(key))
     if match and (unit := unit_of(f"in {match[2]}")):
-        size = value * UNITS[unit] if match[1] != "per" else UNITS[unit] / value
+        size = value * METERS[unit] if match[1] != "per" else METERS[unit] / value
         return float(f"{1 / size:.12g}")
     return float(value) if value >= 1 else float(f"{1 / value:.12g}")

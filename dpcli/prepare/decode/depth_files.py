@@ -35,10 +35,8 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
-_GRAY_NOISE, _COLORED_SHARE = (
-    24,
-    0.02,
-)  # levels between channels, and share of pixels beyond: a color map has most of them
+# levels between channels, and share of pixels beyond: a color map has most of them
+_GRAY_NOISE, _COLORED_SHARE = 24, 0.02
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
 WHITE_AT_ZERO = (
@@ -126,9 +124,8 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
     try:
         tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
         declared = _declared_frames(capture)
-        one_stream = (
-            path.suffix.lower() == ".avi"
-        )  # in others depth often lies beside color; asking takes a tenth of a second
+        # in others depth often lies beside color; asking takes a tenth of a second
+        one_stream = path.suffix.lower() == ".avi"
         stream = None if one_stream and tag in (_GRAY16, *_EIGHT_BITS) else depth_stream(path)
         if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []

@@ -15,9 +15,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.npy_files import require_distinct
 
-_LOCAL = struct.Struct(
-    "<4s22x2H"
-)  # the header in front of a file's own bytes: signature, lengths of name and extra field
+# the header in front of a file's own bytes: signature, lengths of name and extra field
+_LOCAL = struct.Struct("<4s22x2H")
 _COLUMNS = {"offset": "i8", "packed": "i8", "size": "i8", "crc": "u4", "method": "u2", "flags": "u2", "name": "u2"}
 _ENTRY = np.dtype(list(_COLUMNS.items()))  # of each file; name is the length of its whole name, bytes
 _ENCRYPTED, _UTF8 = 1, 0x800  # bits of the flags

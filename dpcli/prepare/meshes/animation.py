@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
+from dpcli.path_names import file_names
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
 from dpcli.prepare.meshes.gltf import Gltf, read_gltf, well_formed
@@ -43,18 +42,14 @@ def _seconds(file: Gltf, index: int) -> float | None:
 def clip_outputs(path: Path, output: str) -> list[tuple[str, str]]:
     """Returns (clip, file) for every clip of a model: OUT.h5 becomes OUT_Walk.h5, OUT_Run.h5, ...
 
-    Characters that a file's name should not have become _; names that are the same then get their clip's number. Clips
-    that are broken, or move nothing, are passed over with a warning. Raises DataError when none is left.
+    Names are those of `file_names`. Clips that are broken, or move nothing, are passed over with a warning. Raises
+    DataError when none is left.
     """
     clips = list_clips(path)
     if all(seconds is None for _, seconds in clips):
         raise DataError(f"{path}: none of its {len(clips)} clips can be read")
-    names = [name for name, _ in clips]
-    short = [re.sub(r"[^\w.-]+", "_", name.split("|")[-1]).strip("_.")[:80] or "clip" for name in names]
-    many = [key for key, count in Counter(name.lower() for name in short).items() if count > 1]
-    short = [f"{name}_{index}" if name.lower() in many else name for index, name in enumerate(short)]
-    place = Path(output)
-    made = ((clip, place.with_name(f"{place.stem}_{end}{place.suffix}")) for clip, end in zip(clips, short))
+    place, ends = Path(output), file_names([name.split("|")[-1] for name, _ in clips], "clip")
+    made = ((clip, place.with_name(f"{place.stem}_{end}{place.suffix}")) for clip, end in zip(clips, ends))
     return [(name, str(file)) for (name, seconds), file in made if seconds is not None]
 
 

@@ -8,9 +8,8 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material, Texture
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 
-_LIGHT = np.array(
-    [0.37, 0.74, 0.56], np.float32
-)  # unit, where the light comes from: above, in front, a little to the right
+# unit, where the light comes from: above, in front, a little to the right
+_LIGHT = np.array([0.37, 0.74, 0.56], np.float32)
 _DECODED = to_linear(np.arange(256) / 255).astype(np.float32)
 _LAYERS = 16  # most surfaces that one ray passes through
 _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface

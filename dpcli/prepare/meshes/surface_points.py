@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,21 +77,29 @@ def choose_visible(
 
     triangles f64 (T,3,3), poses f64 (T,4,4): where each triangle stands.
     """
-    scene = _scene(triangles @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3])
+    scene = raycasting_scene(triangles @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3])
     for side in _IMAGE_SIDES:
-        hits = scene.cast_rays(load_open3d().core.Tensor(camera.rays(side, rng)))
-        seen = np.flatnonzero(np.isfinite(hits["t_hit"].numpy()))
-        if len(seen) >= count:
+        seen = first_hits(scene, camera.rays(side, rng))
+        if len(seen.triangle) >= count:
             break
-    seen = rng.permutation(seen)[:count]
+    chosen = rng.permutation(len(seen.triangle))[:count]
+    return SurfacePoints(seen.triangle[chosen], seen.weights[chosen])
+
+
+def raycasting_scene(triangles: np.ndarray) -> Any:
+    """Returns Open3D's scene of triangles (T,3,3), in which rays are cast by one thread: one process per CPU is the parallelism."""
+    open3d = load_open3d()
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    corners = np.ascontiguousarray(triangles.reshape(-1, 3), np.float32)
+    faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(open3d.core.Tensor(corners), open3d.core.Tensor(faces))
+    return scene
+
+
+def first_hits(scene: Any, rays: np.ndarray) -> SurfacePoints:
+    """Returns where rays f32 (R,6), origin and direction, first meet the triangles of a scene; those that meet none are left out."""
+    hits = scene.cast_rays(load_open3d().core.Tensor(rays))
+    seen = np.flatnonzero(np.isfinite(hits["t_hit"].numpy()))
     uv = hits["primitive_uvs"].numpy()[seen].astype(np.float64)
     weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], axis=1)
     return SurfacePoints(hits["primitive_ids"].numpy()[seen].astype(np.int64), weights)
-
-
-def _scene(triangles: np.ndarray):
-    open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    corners = open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32))
-    scene.add_triangles(corners, open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)))
-    return scene

@@ -115,9 +115,8 @@ def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration 
 
     For rectified images (``rect`` in the name of the topic) its projection P counts, else its K and lens.
     """
-    matrix, lens, projection = (
-        [float(v) for v in _either(content, name)] for name in ("k", "d", "p")
-    )  # ROS 1 has them in capitals
+    # ROS 1 has them in capitals
+    matrix, lens, projection = ([float(v) for v in _either(content, name)] for name in ("k", "d", "p"))
     rectified = "rect" in topic.rpartition("/")[2] or "rect" in topic.split("/")[-2:][0]
     numbers = (
         [projection[k] for k in (0, 5, 2, 6)] if rectified and any(projection) else [matrix[k] for k in (0, 4, 2, 5)]

@@ -24,7 +24,7 @@ from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden
-from dpcli.store.schema import kept_name
+from dpcli.store.schema import kept_names
 
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
@@ -99,7 +99,7 @@ class ArraySequences:
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
         time, color = self._first
-        return (("time",) if time else ()) + (("color",) if color else ()) + tuple(map(kept_name, self.keep))
+        return (("time",) if time else ()) + (("color",) if color else ()) + kept_names(self.keep)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -11,11 +11,10 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
-from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
-from dpcli.store.schema import kept_name
+from dpcli.store.schema import METERS, kept_name
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
@@ -45,14 +44,14 @@ class Lengths:
     def divisor(self, clouds: Sequence[Cloud]) -> tuple[float, dict[str, int]]:
         """Returns what the coordinates are divided by, and a note where the files themselves decided that."""
         declared = {cloud.unit for cloud in clouds} - {""}
-        if self.scale is not None or self.unit not in UNITS or not declared - {self.unit}:
+        if self.scale is not None or self.unit not in METERS or not declared - {self.unit}:
             return self.scale or 1.0, {}
         if len({cloud.unit for cloud in clouds}) > 1:
             names = ", ".join(sorted(cloud.unit or "none" for cloud in clouds))
             raise DataError(f"its frames declare different units ({names[:80]}); --scale says what they are in")
         (name,) = declared
         note = f"sequences converted from {name} to {self.unit}, as their files declare"
-        return UNITS[self.unit] / UNITS[name], {note: 1}
+        return METERS[self.unit] / METERS[name], {note: 1}
 
 
 def assemble(

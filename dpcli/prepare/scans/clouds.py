@@ -19,7 +19,7 @@ from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
 from dpcli.prepare.series import Series, about_series
-from dpcli.store.schema import kept_name
+from dpcli.store.schema import kept_names
 
 _LISTED = 8
 _LOOKED_AT = 5  # frames that tell how many columns a .bin has
@@ -62,7 +62,7 @@ class CloudFolders:
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
-        kept = tuple(map(kept_name, self.keep))
+        kept = kept_names(self.keep)
         return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + kept
 
     @property

@@ -157,9 +157,8 @@ class SemanticKitti:
         moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _), m in zip(kept, motions, strict=True)]
         clouds = [orient_points(to_camera_axes(points) if whole else points, self.coordinates) for points in moved]
         sizes = np.cumsum([len(ids) for _, ids, _ in kept])[:-1]
-        part = renumber_objects(
-            np.concatenate([ids for _, ids, _ in kept])
-        )  # over all frames: an object keeps its number
+        # over all frames: an object keeps its number
+        part = renumber_objects(np.concatenate([ids for _, ids, _ in kept]))
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))

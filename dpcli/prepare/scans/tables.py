@@ -24,7 +24,7 @@ from dpcli.prepare.scans.cloud_series import refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.runtime.clips.other_files import stand_in
-from dpcli.store.schema import kept_name
+from dpcli.store.schema import kept_names
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
 _FEW = 5  # frames of one point that may be true
@@ -70,7 +70,7 @@ class TableSequences:
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
-        kept = tuple(map(kept_name, self.keep))
+        kept = kept_names(self.keep)
         color, time = self._found
         return (("time",) if time else ()) + (("color",) if color else ()) + kept
 

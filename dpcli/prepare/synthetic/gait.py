@@ -38,7 +38,7 @@ Turns = dict[str, list[tuple[np.ndarray, np.ndarray]]]  # bone name -> (axis, an
 
 
 def turn_bones(animal: Creature, motion: str, phase: np.ndarray) -> tuple[Turns, np.ndarray]:
-    """Turns of the bones and where the root goes f64 (T,3), at phase (T): 1 per cycle."""
+    """Returns how the bones turn and where the root goes f64 (T,3), at phase (T): 1 per cycle."""
     w = 2 * np.pi * phase
     if animal.kind == "bird":
         return _fly(w)

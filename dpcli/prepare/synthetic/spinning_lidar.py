@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.ops.open3d_import import load_open3d
+from dpcli.prepare.meshes.surface_points import raycasting_scene
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,8 @@ def scan(
     noise: standard deviation of ranges, meters. dropout: share of the rays lost anywhere; those that meet a surface
     at a small angle or far away are lost more often.
     """
-    open3d = load_open3d()
-    scene, rays = open3d.t.geometry.RaycastingScene(nthreads=1), lidar_rays(lidar, rng)
-    corners = np.ascontiguousarray(triangles.reshape(-1, 3), np.float32)
-    faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    scene.add_triangles(open3d.core.Tensor(corners), open3d.core.Tensor(faces))
-    hits = scene.cast_rays(open3d.core.Tensor(np.concatenate([np.zeros_like(rays), rays], 1)))
+    scene, rays = raycasting_scene(triangles), lidar_rays(lidar, rng)
+    hits = scene.cast_rays(load_open3d().core.Tensor(np.concatenate([np.zeros_like(rays), rays], 1)))
     reach = hits["t_hit"].numpy()
     facing = np.abs((hits["primitive_normals"].numpy() * rays).sum(1))
     lost = dropout + 0.5 * np.exp(-facing / 0.05) + 0.3 * (np.minimum(reach, lidar.far) / lidar.far) ** 2

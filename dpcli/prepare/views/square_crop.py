@@ -96,7 +96,7 @@ def touches_border(rgba: np.ndarray) -> bool:
 
 
 def union(boxes: list[Box]) -> Box:
-    """Returns the smallest box that holds all of these, None when all are None."""
+    """Returns the smallest box that holds all of these, of which there is at least one."""
     left, top, right, bottom = np.array(boxes).T
     return int(left.min()), int(top.min()), int(right.max()), int(bottom.max())
 

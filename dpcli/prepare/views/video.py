@@ -138,8 +138,7 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
             p for one in sorted(folder.iterdir()) if one.is_dir() for p in image_paths(one)
         )
     if options.views_cameras:
-        require_cameras = read_cameras(options.views_cameras)
-        config["cameras"] = [asdict(camera) for camera in require_cameras]
+        config["cameras"] = [asdict(camera) for camera in read_cameras(options.views_cameras)]
     return config
 
 
@@ -311,7 +310,9 @@ def open_masks(place: Path) -> Frames:
     if place.is_file():
         return open_frames(place)
     folder = require_folder(place, "a mask per frame, as images, or a video")
-    if not image_paths(folder) and (other := [p.name for p in sorted(folder.iterdir()) if p.suffix in _ANNOTATIONS]):
+    if not image_paths(folder) and (
+        other := [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _ANNOTATIONS]
+    ):
         raise DataError(
             f"{place}: {first_names(other, 3)}: annotations and arrays are not read as masks; draw each frame's as a PNG, "
             '255 where the object is (labelme_export_json, CVAT\'s "Segmentation mask" and the like do it)'
@@ -358,8 +359,7 @@ def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:
     if fps is None and frames.times is None:
         log.info(f"{frames.path}: no frame rate; {FOLDER_FPS:g} per second assumed (--fps)")
     rate = fps or FOLDER_FPS
-    times = np.array([index / rate for index in wanted] if fps or frames.times is None else frames.times)
-    times = times if len(times) == len(wanted) else times[wanted]
+    times = np.array(wanted) / rate if fps or frames.times is None else np.array(frames.times)[wanted]
     return times - times[0]
 
 

@@ -66,8 +66,8 @@ class ArtemisIndex:
         return "; ".join(faults)
 
     def _lacking_bones(self, motion: Motion) -> Iterator[str]:
-        """Returns which bones lack: without bones/ an animal has no true tracks, which is allowed; some of them is
-        not.
+        """Yields the files of bones that are missing. An animal may lack the whole folder bones/, and has no true tracks
+        then; it may not have some of them alone.
         """
         if (self.animal / "bones").is_dir():
             for frame in motion.folders:
@@ -77,7 +77,7 @@ class ArtemisIndex:
 
 
 def _lacking_pictures(motion: Motion, cameras: int) -> Iterator[str]:
-    """Returns pictures and masks that a frame lacks of the cameras that any frame shows."""
+    """Yields the pictures and masks that a frame lacks of the cameras that any frame shows."""
     found = {frame: _pictures(folder) for frame, folder in motion.folders.items()}
     used = sorted({camera for own in found.values() for camera, _ in own if camera < cameras}) or range(cameras)
     for frame, own in found.items():

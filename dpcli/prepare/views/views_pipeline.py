@@ -42,7 +42,7 @@ def convert_clip(
     seed: int = 0,
     force: bool = False,
 ) -> ViewsHeader:
-    """Writes a clip to `output` and return its header; a finished file of the same configuration is left as it is.
+    """Writes a clip to `output` and returns its header; a finished file of the same configuration is left as it is.
 
     config: everything that decides the content, digests of the inputs among them. Raises UsageError when `output` was
     made another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).

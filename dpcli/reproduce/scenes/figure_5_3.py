@@ -8,12 +8,11 @@ OUT/table.md and OUT/figure.png. What is done already is not done again.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dpcli.draw.sheet import save_figure
-from dpcli.reproduce.runs import markdown, write_text
+from dpcli.reproduce.runs import markdown, sweeps, write_text
 from dpcli.reproduce.scenes.table_5_2 import fit_all, mean_score, parser_of
 
 SWEEPS = {  # setting -> title, values, the thesis's choice
@@ -69,16 +68,7 @@ def picture(found: Found, path: Path) -> None:
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
     """Returns the values of each sweep; `control_points=32,512` gives the values of one, and others are then left out."""
-    values: dict[str, tuple[float, ...]] = {}
-    for option in options:
-        setting, _, text = option.partition("=")
-        try:
-            values[setting] = tuple(sorted({float(word) for word in text.split(",")}))
-        except ValueError:
-            setting = ""
-        if setting not in SWEEPS:
-            print(f"--sweep {option}: expected NAME=1,2,... with one of {', '.join(SWEEPS)}", file=sys.stderr)
-            sys.exit(2)
+    values = {setting: tuple(sorted(set(own))) for setting, own in sweeps(options, SWEEPS, least=1).items()}
     return values or {setting: own for setting, (_, own, _) in SWEEPS.items()}
 
 

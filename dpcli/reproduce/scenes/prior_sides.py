@@ -154,7 +154,7 @@ def table(scores: dict[str, dict[str, dict]]) -> str:
 
 def main(load: Callable[[str], ShapePrior] = Network) -> None:
     """Scores all rows on the clips that the command line names, and prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--clips", default=CLIPS)

@@ -142,7 +142,7 @@ def table(scores: dict[str, list[dict]], side: str) -> str:
 
 def main() -> None:
     """Makes and scores all rows on the clips that the command line names, and prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--meshes", type=Path)

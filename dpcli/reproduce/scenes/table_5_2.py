@@ -128,7 +128,7 @@ def _steps(text: str) -> list[int]:
 
 def parser_of(description: str | None) -> argparse.ArgumentParser:
     """Returns the words that a program of fits to animated meshes takes."""
-    parser = argparse.ArgumentParser(description=description)
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--clips", type=_clips, default=CLIPS, metavar="MODEL:CLIP,...")

@@ -6,9 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 
-Matrix = tuple[
-    int, int, int, int
-]  # a, b, c, d: what is stored at (x, y) from the middle is shown at (ax + cy, bx + dy)
+# a, b, c, d: what is stored at (x, y) from the middle is shown at (ax + cy, bx + dy)
+Matrix = tuple[int, int, int, int]
 _BESIDE = {1: "side by side", 2: "one above the other", 4: "pixel by pixel", 5: "side by side", 6: "line by line"}
 _BESIDE |= {7: "column by column"}
 _FLAT = 4  # a projection that is none

@@ -25,9 +25,8 @@ _DATE = re.compile(
 _YEAR_LAST = re.compile(
     r"([0-3]\d)[-_.]([0-3]\d)[-_.]((?:19|20)\d\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
 )
-_SECONDS = re.compile(
-    r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|[1-9]\d{6,7}|\d{9}))(?!\d)"
-)  # since 1970, and their parts
+# since 1970, and their parts
+_SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|[1-9]\d{6,7}|\d{9}))(?!\d)")
 _PARTED = re.compile(r"(?<!\d)([12]\d{9})([_-])(\d{1,9})(?!\d)")  # the same, of any length
 _MICROSECONDS, _NANOSECONDS = 6, 9  # digits of the parts
 _TICK_PLACES = 7

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import first_names
+from dpcli.path_names import file_names, first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.whole_file import PICTURES, check_target, make_folder, refuse_existing, whole_file
+from dpcli.runtime.whole_file import PICTURES, check_target, make_folder, refuse_existing, refuse_replacing, whole_file
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
@@ -28,15 +28,14 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
     a folder for a URDF of each sequence. picture: of the one, or the first. Raises UsageError for an output that exists
     (without `force`) or can't hold what was asked for, DataError for a sequence whose motions are unknown.
     """
-    if output.suffix in SUFFIXES:
-        refuse_existing(output, force)
-    elif str(output) != "-" and output.exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    suffix = output.suffix.lower()
+    if str(output) != "-":
+        (refuse_existing if suffix in SUFFIXES else refuse_replacing)(output, force)
     if picture is not None:
         check_target(picture, "--picture", PICTURES)
     with input_file(parts) as path, PartsReader(path) as reader:
         chosen = _chosen(reader, sequence)
-        if output.suffix == ".urdf" and len(chosen) > 1:
+        if suffix == ".urdf" and len(chosen) > 1:
             raise UsageError(
                 f"-o {output}: one object, but {path.name} has {len(chosen)} sequences; name one with --sequence, or a folder"
             )
@@ -46,7 +45,7 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
             with output_file("-") as target:
                 _write_parts(trees, target, reader, path, force)
         else:
-            _WRITERS.get(output.suffix.lower(), _write_folder)(trees, output, reader, path, force)
+            _WRITERS.get(suffix, _write_folder)(trees, output, reader, path, force)
     return counts
 
 
@@ -97,7 +96,7 @@ def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, fo
 
 def _write_urdf(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
     for _, sequence, tree in trees:
-        write_urdf(output, tree, sequence.name)
+        write_urdf(output, tree, sequence.name, reader.length_unit)
         log.info(f"{output}: {len(tree.points)} links; meshes in {output.stem}_meshes")
 
 
@@ -118,18 +117,11 @@ def _write_folder(trees: Trees, output: Path, reader: PartsReader, path: Path, f
 
 
 def _fill_folder(folder: Path, trees: Trees, reader: PartsReader) -> None:
-    objects, taken = [], set()
+    objects, names = [], file_names(reader.names)
     for index, sequence, tree in trees:
-        name = _file_name(sequence.name)
-        name = f"{name}_{index}" if name in taken else name
-        taken.add(name)
-        write_urdf(folder / f"{name}.urdf", tree, sequence.name)
+        write_urdf(folder / f"{names[index]}.urdf", tree, sequence.name, reader.length_unit)
         objects.append(tree_json(tree, sequence.name, reader.length_unit))
     write_trees(folder / "joints.json", objects)
-
-
-def _file_name(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in name).lstrip(".") or "object"
 
 
 _WRITERS: dict[str, Callable[[Trees, Path, PartsReader, Path, bool], None]] = {

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import UsageError
+from dpcli.path_names import file_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.machines.once_per_process import OncePerProcess
@@ -229,11 +230,11 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
             shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
             sequences, look = [reader.read(int(i)) for i in shown], None
             if scene:
-                sequences, looks = zip(*map(picture_of_scene, sequences))
+                sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
                 look = looks[0]
             parts_picture(drawings.picture, sequences, look=look)
         if drawings.turntable is not None:
             turntable(drawings.turntable, reader.read(0))
         if drawings.ply is not None:
-            for index in range(len(reader)):
-                write_ply_frames(drawings.ply / reader.names[index].replace("/", "_"), reader.read(index))
+            for index, name in enumerate(file_names(reader.names)):
+                write_ply_frames(drawings.ply / name, reader.read(index))

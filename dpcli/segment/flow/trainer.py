@@ -20,6 +20,7 @@ from dpcli.segment.flow.flowstep3d import FlowStep3D
 from dpcli.segment.flow.losses import flow_loss
 from dpcli.segment.flow.model_file import augment_pair, save_flow_model
 from dpcli.segment.frame_pairs import PairSource
+from dpcli.segment.sequence_splits import hold_out_sequences
 from dpcli.store import CloudsReader
 
 _JUDGED = 64  # held-out pairs
@@ -27,7 +28,7 @@ COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "lear
 
 
 class FlowTrainer:
-    """Trains a flow network on the adjacent pairs, both ways, of split `train` (of all sequences if there is none).
+    """Trains a flow network on the adjacent pairs, both ways, of the sequences that `hold_out_sequences` gives to learn from.
 
     Adam at 1e-3, halved every 400,000 pairs, not below 1e-5. Pairs are scaled to diameter 1 and changed as `augment_pair`
     says. Every `log_every` steps (None: 40 times in all) the log gets a row; split `validation` chooses the network that
@@ -50,7 +51,9 @@ class FlowTrainer:
         self.folder, self.seed, self.device, self.stop = folder, seed, device, stop
         self.steps, self.batch = schedule.steps, schedule.batch
         self.log_every = log_every or max(1, self.steps // 40)
-        self.source, self.held = _training_and_held_out_pairs(reader, schedule.points, seed)
+        learned, held = hold_out_sequences(reader, "auto", seed)
+        self.source = PairSource(reader, learned, schedule.points, seed)
+        self.held = PairSource(reader, held, schedule.points, seed) if held else None
         torch.manual_seed(int(generator(seed, SegmentStream.FLOW_TRAINING, 0).integers(2**31)))
         self.model = FlowStep3D(network).to(device)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-3)
@@ -170,13 +173,3 @@ class FlowTrainer:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.folder.tell_continuing(f"step {self.step + 1} of {self.steps}" if self.step < self.steps else None)
-
-
-def _training_and_held_out_pairs(reader: CloudsReader, points: int, seed: int) -> tuple[PairSource, PairSource | None]:
-    """Returns the pairs of split `train`, or of all sequences where none is named so, and those of split `validation`."""
-    long = [i for i in range(len(reader)) if reader.frame_counts[i] > 1]
-    train = [i for i in long if reader.splits[i] == "train"]
-    if "train" not in reader.splits:
-        train = long
-    held = [i for i in long if reader.splits[i] == "validation"]
-    return PairSource(reader, train, points, seed), PairSource(reader, held, points, seed) if held else None

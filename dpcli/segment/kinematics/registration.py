@@ -63,6 +63,8 @@ def _spread(own: np.ndarray, others: list[np.ndarray], rng: np.random.Generator)
     ends = []
     for _ in range(_SAMPLES):
         surface = Surface(_some(rest, len(rest) // 2, rng))
+        if not surface.spacing:  # its points lie on one another
+            return np.eye(6)
         shake = rng.normal(size=6) * surface.spacing / np.sqrt(3)
         start = twist_motion(shake * np.repeat([2.0, 1.0], 3), np.zeros(3))
         half = columns(_some(own, len(own) // 2, rng))

@@ -15,26 +15,29 @@ from dpcli.segment.kinematics.kinematic_tree import KinematicTree, PartJoint
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.standard_streams import printable
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE, TYPES
+from dpcli.store.schema import METERS
 
 _URDF_TYPES = {REVOLUTE: "revolute", PRISMATIC: "prismatic", FIXED: "fixed", FREE: "floating"}
 
 
-def write_urdf(path: Path, tree: KinematicTree, name: str) -> None:
+def write_urdf(path: Path, tree: KinematicTree, name: str, unit: str) -> None:
     """Writes the tree as a URDF file, and a folder of meshes (.obj) beside it: `object_meshes` beside `object.urdf`.
 
     At joint values 0 the object is as in frame 0; a link's origin lies on its joint's axis. Limits are the values seen.
+    Lengths are meters, as URDF has them, where the tree's unit is a known one.
     Raises DpcError where a file can't be written.
     """
     folder = path.with_name(f"{path.stem}_meshes")
     make_folder(folder)
     robot = ElementTree.Element("robot", name=printable(name))  # XML has no place for control characters
-    origins = link_origins(tree)
+    origins, meters = link_origins(tree), METERS.get(unit, 1.0)
     for row, part in enumerate(tree.trajectories.ids.tolist()):
         file = folder / f"part_{part}.obj"
-        write_whole(file, _obj(*part_surface(tree.points[row] - origins[row])))
+        vertices, triangles = part_surface(tree.points[row] - origins[row])
+        write_whole(file, _obj(vertices * meters, triangles))
         robot.append(_link(part, f"{folder.name}/{file.name}"))
     for joint in tree.joints:
-        robot.append(_joint(joint, tree, origins))
+        robot.append(_joint(joint, tree, origins, meters))
     ElementTree.indent(robot)
     write_whole(path, b'<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="utf-8") + b"\n")
 
@@ -60,15 +63,17 @@ def _link(part: int, mesh: str) -> ElementTree.Element:
     return link
 
 
-def _joint(joint: PartJoint, tree: KinematicTree, origins: np.ndarray) -> ElementTree.Element:
+def _joint(joint: PartJoint, tree: KinematicTree, origins: np.ndarray, meters: float) -> ElementTree.Element:
     ids, fit = tree.trajectories.ids, joint.fit
     element = ElementTree.Element("joint", name=f"joint_{ids[joint.child]}", type=_URDF_TYPES[fit.kind])
     ElementTree.SubElement(element, "parent", link=f"part_{ids[joint.parent]}")
     ElementTree.SubElement(element, "child", link=f"part_{ids[joint.child]}")
-    ElementTree.SubElement(element, "origin", xyz=_numbers(origins[joint.child] - origins[joint.parent]), rpy="0 0 0")
+    offset = meters * (origins[joint.child] - origins[joint.parent])
+    ElementTree.SubElement(element, "origin", xyz=_numbers(offset), rpy="0 0 0")
     if fit.kind in (REVOLUTE, PRISMATIC):
         ElementTree.SubElement(element, "axis", xyz=_numbers(fit.axis))
-        low, high = (f"{value:.9g}" for value in (fit.value.min(), fit.value.max()))
+        scale = meters if fit.kind == PRISMATIC else 1.0
+        low, high = (f"{scale * value:.9g}" for value in (fit.value.min(), fit.value.max()))
         ElementTree.SubElement(element, "limit", lower=low, upper=high, effort="1", velocity="1")
     return element
 

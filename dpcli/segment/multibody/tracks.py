@@ -52,10 +52,9 @@ def follow_tracks(clouds: list[np.ndarray], tracks: list[np.ndarray]) -> Tracks:
 
     A track that a frame doesn't show goes on as the nearest eight that both frames show, by their rigid motion.
     """
-    _, found = np.unique(np.concatenate(tracks), return_inverse=True)
+    identities, found = np.unique(np.concatenate(tracks), return_inverse=True)
     index = np.split(found.reshape(-1), np.cumsum([len(own) for own in tracks])[:-1])
-    count = max(map(int, found)) + 1 if len(found) else 0
-    places, shown = np.zeros((len(clouds), count, 3)), np.zeros((len(clouds), count), bool)
+    places, shown = np.zeros((len(clouds), len(identities), 3)), np.zeros((len(clouds), len(identities)), bool)
     for t, own in enumerate(index):
         places[t, own], shown[t, own] = clouds[t], True
     known = shown.copy()

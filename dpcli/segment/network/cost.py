@@ -95,12 +95,12 @@ def measure_cost(config: PartConfig, device: torch.device) -> dict[str, Any]:
     frames = torch.nn.functional.normalize(torch.randn(4, config.points, 3), dim=-1).to(device) * 0.5
     counts = count_macs(model, frames[:1])
     parts = {name: count_parameters(module) for name, module in model.named_children()}
-    linear = sum(count_parameters(m) for m in model.modules() if isinstance(m, nn.MultiheadAttention))
+    attention = sum(count_parameters(m) for m in model.modules() if isinstance(m, nn.MultiheadAttention))
     return {
         "group": config.group,
         "points": config.points,
         "slots": config.slots,
-        "parameters": {"total": count_parameters(model), **parts, "attention": linear},
+        "parameters": {"total": count_parameters(model), **parts, "attention": attention},
         "paper_style_parameters": {"total": paper_parameters(model), "rule": "1x1 layers and layer norms only"},
         "macs_per_frame": counts,
         "uncounted": "neighbor search, norms, activations, softmax, interpolation between levels",

@@ -2,7 +2,7 @@
 
 Features obey f2(T x, T R_a) = f1(x, R_a) for a part that moves by T. So rotation a of frame 1 looks like that rotation l
 of frame 2 whose R_l is nearest to T R_a, and T = R_l r^T R_a^T with a small residual r. The release feeds its label rule
-T instead of T^T and so pairs rotations that don't look alike (as the release has it).
+T instead of T^T and so pairs rotations that don't look alike.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class MotionHead(nn.Module):
         anchors = self.group.rotations_like(points)
         share = mask / mask.sum(1, keepdim=True).clamp(min=1e-6)
         center = torch.einsum("bps,bpi->bsi", share, points)
-        centered = points[:, :, None] - torch.einsum("bps,bsi->bpi", mask, center)[:, :, None]
-        local = torch.einsum("gij,bpi->bpgj", anchors, centered[:, :, 0])
+        centered = points - torch.einsum("bps,bsi->bpi", mask, center)
+        local = torch.einsum("gij,bpi->bpgj", anchors, centered)
         hidden = torch.relu(self.embed(torch.cat([features, local.to(features.dtype)], -1)))
         slots = [(hidden * mask[:, :, s, None, None]).amax(1) for s in range(mask.shape[-1])]
         return torch.stack(slots, 1)

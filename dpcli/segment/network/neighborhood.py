@@ -54,7 +54,7 @@ def first_neighborhood(points: Tensor, centers: Tensor, radius: float, count: in
     found = hit.sum(-1, keepdim=True).clamp(min=1)
     order = torch.argsort((~hit).to(torch.uint8), dim=-1, stable=True)
     slot = torch.arange(count, device=points.device).expand(*order.shape[:2], count)
-    index = order.gather(2, torch.minimum(slot % found, torch.tensor(points.shape[1] - 1)))
+    index = order.gather(2, slot % found)
     quirk = (found == count - 1) & (slot == count - 1)
     index = torch.where(quirk, 0, index)
     offsets = gather_points(points, index) - centers[..., None, :]

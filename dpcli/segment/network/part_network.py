@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from dpcli.ops import gather_points
-from dpcli.ops.nearest_neighbors import knn
+from dpcli.ops import gather_points, knn
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.encoder import Encoder, Level

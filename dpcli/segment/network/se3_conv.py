@@ -91,9 +91,8 @@ class GroupConv(nn.Module):
         return _GroupConv.apply(features, self.weight, self.table, self.back)
 
 
-_POINTS = (
-    32  # whose turned features are held at a time: a MiB or two, which stay in the cache until they are multiplied
-)
+# how many points' turned features are held at a time: a MiB or two, which stay in the cache until they are multiplied
+_POINTS = 32
 
 
 class _GroupConv(torch.autograd.Function):

@@ -102,9 +102,8 @@ def _low_heights(flat: np.ndarray, z: np.ndarray, size: np.ndarray) -> np.ndarra
 
 def _limit_slope(heights: np.ndarray) -> np.ndarray:
     """Returns the highest ground f64 (X,Y) below the heights that rises no more than `_SLOPE`."""
-    around = ndimage.percentile_filter(
-        heights, 20, 5, mode="nearest"
-    )  # unknown cells are infinite: the lowest ones count
+    # unknown cells are infinite: the lowest ones count
+    around = ndimage.percentile_filter(heights, 20, 5, mode="nearest")
     heights = np.where(np.isfinite(around) & (heights < around - _PIT), around, heights)
     step = np.hypot(*np.mgrid[-_AROUND : _AROUND + 1, -_AROUND : _AROUND + 1]) * _CELL * _SLOPE
     return ndimage.grey_erosion(heights, structure=-step, mode="constant", cval=np.inf)

@@ -8,6 +8,7 @@ from dpcli.segment.pictures import Look
 from dpcli.segment.scene.ground import find_up
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsReader, PartsSample
+from dpcli.store.schema import METERS
 
 _NAMED = 8  # objects of a sequence that are named one by one
 _SHOWN = 30.0  # meters around the middle that a picture shows
@@ -45,13 +46,15 @@ def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> 
     return f"{step} ({rate:.1f} {unit}/s)" if np.isfinite(rate) else step
 
 
-def picture_of_scene(sequence: CloudSequence) -> tuple[CloudSequence, Look]:
+def picture_of_scene(sequence: CloudSequence, length_unit: str) -> tuple[CloudSequence, Look]:
     """Returns what a picture shows of a scene, what stands without a color, and from where: obliquely from above."""
+    sequence.points = sequence.points * np.float32(METERS.get(length_unit, 1.0))
     middle = np.median(sequence.points, axis=0)
     reach = np.linalg.norm(sequence.points - middle, axis=1)
     shown = np.flatnonzero(reach <= max(_SHOWN, float(np.percentile(reach, 20))))
     offsets = np.searchsorted(shown, sequence.frame_offsets)
-    up = find_up(sequence.frame(0).astype(np.float64), None)[0]
+    first = next(frame for frame in map(sequence.frame, range(sequence.num_frames)) if len(frame))
+    up = find_up(first.astype(np.float64), None)[0]
     axis = int(np.abs(up).argmax())
     sequence.take_points(shown, offsets)
     sequence.part = np.where(sequence.part == 0, -1, sequence.part).astype(np.int16)

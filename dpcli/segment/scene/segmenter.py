@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 from dpcli.segment.scene.explain import explain_scene
 from dpcli.segment.scene.settings import SceneSettings
@@ -16,8 +17,9 @@ from dpcli.segment.scene.tracking import moved
 from dpcli.segment.segmenters import Flows, Segmenter
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
+from dpcli.store.schema import METERS
 
-_METERS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0}
+_FARTHEST = 1e7  # meters, between points of a scene
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,20 @@ class SceneSegmenter(Segmenter):
     ) -> tuple[np.ndarray, PartsSample]:
         """Returns the labels i16 (P) of a sequence, and masks, motions and flow of the pairs of frames, in its own unit.
 
-        Frames are looked at in the order of `time` where it is known; units that are no lengths count as meters.
+        Frames are looked at in the order of `time` where it is known; units that are no lengths count as meters. Raises
+        DataError for points farther apart than any two on Earth.
         """
-        count, unit = sequence.num_frames, _METERS.get(length_unit, 1.0)
+        count, unit = sequence.num_frames, METERS.get(length_unit, 1.0)
         order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
         to_meters = np.diag([unit, unit, unit, 1.0])
         to_meters[:3, 3] = -unit * np.median(sequence.points, axis=0)
         clouds = [moved(np.float64(sequence.frame(t)), to_meters) for t in range(count)]
+        reach = unit * float(np.ptp(sequence.points, axis=0).max())
+        if reach > _FARTHEST:
+            raise DataError(
+                f"points lie {reach:.3g} m apart, expected a street or a room; convert the data again with"
+                f" the right --unit (the file's is {length_unit or 'unknown'})"
+            )
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
         found = explain_scene([clouds[t] for t in order], list(moved(origins, to_meters)), self.settings)
         place = np.argsort(order)

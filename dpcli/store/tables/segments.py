@@ -115,6 +115,10 @@ def _json_of(path: str | Path, text: str) -> Mapping[str, Any]:
     rows = found.get("segments") if isinstance(found, dict) and found.get("kind") == "segments" else None
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise DataError(f"{path}: no segments; expected what `dpc classify predict --segments` writes")
+    for key, kind in (("class_names", str), ("provenance", dict)):
+        told = found.get(key, [])
+        if not isinstance(told, list) or not all(isinstance(one, kind) for one in told):
+            raise DataError(f"{path}: {key} is {told!r:.80}, expected what `dpc classify predict --segments` writes")
     return found
 
 
@@ -157,7 +161,7 @@ def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
         )
     try:
         confidence = float(row.get("confidence") or "nan")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError(f"{where}: confidence {row.get('confidence')!r}; expected a number") from None
     return name, Segment(start, end, title.strip(), confidence)
 
@@ -165,7 +169,7 @@ def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
 def _whole(where: str, key: str, value: Any) -> int:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if isinstance(value, bool) or not 0 <= number < _MOST_FRAMES or number != int(number):
         raise DataError(f"{where}: {key} {value!r}; expected a frame's number, from 0 to {_MOST_FRAMES:,}")

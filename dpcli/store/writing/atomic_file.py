@@ -83,7 +83,7 @@ class AtomicFile:
         return disk_full(self.target, error, advice, needed=self.needed)
 
     def flush(self) -> None:
-        """Hands everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
+        """Hands everything to the system and lets the disk start on it: else `commit` waits for all of it at the end."""
         self.file.flush()
         if hasattr(os, "posix_fadvise"):
             size = os.fstat(self.handle).st_size

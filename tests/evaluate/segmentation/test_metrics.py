@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
     average_precision,
     segmentation_compute,
-    segmentation_merge,
     segmentation_update,
 )
 from dpcli.evaluate.segmentation.part_matching import match_parts, mean_iou
@@ -66,7 +66,7 @@ def test_golden_cases_of_the_published_code(golden):
     for name, case in golden.items():
         below = int(case["ignore_npoint_thresh"])
         frames = [Frame(ids, mask.argmax(1), mask) for ids, mask in zip(case["segm"], case["mask"], strict=True)]
-        found = segmentation_merge(
+        found = merge_statistics(
             segmentation_update([frame], ignore_below=below, protocol="release") for frame in frames
         )
         metrics = segmentation_compute(found, "release")
@@ -85,7 +85,7 @@ def test_the_fixed_protocol_differs_from_golden_only_where_it_should(golden):
     for name, case in golden.items():
         below = int(case["ignore_npoint_thresh"])
         frames = [Frame(ids, mask.argmax(1), mask) for ids, mask in zip(case["segm"], case["mask"], strict=True)]
-        found = segmentation_compute(segmentation_merge(segmentation_update([f], ignore_below=below) for f in frames))
+        found = segmentation_compute(merge_statistics(segmentation_update([f], ignore_below=below) for f in frames))
         expected = {"miou": case["miou_per_frame"].mean(), "f1": case["seg_scores"][2], "ap": case["seg_scores"][0]}
         for key, value in expected.items():
             if abs(getattr(found, key) - value) > TOLERANCE:
@@ -216,11 +216,11 @@ def random_frames(seed: int, count: int = 4) -> list[Frame]:
 @pytest.mark.parametrize("protocol", ["dpc", "release"])
 def test_shards_add_up_exactly(protocol):
     objects = [segmentation_update(random_frames(seed), ignore_below=8, protocol=protocol) for seed in range(6)]
-    whole = segmentation_compute(segmentation_merge(objects), protocol)
-    halves = segmentation_merge(objects[:2]) + segmentation_merge(objects[2:])
+    whole = segmentation_compute(merge_statistics(objects), protocol)
+    halves = merge_statistics(objects[:2]) + merge_statistics(objects[2:])
     assert segmentation_compute(halves, protocol) == whole
     with pytest.raises(DataError, match="no statistics"):
-        segmentation_merge([])
+        merge_statistics([])
 
 
 def test_names_of_parts_and_order_of_points_do_not_matter():

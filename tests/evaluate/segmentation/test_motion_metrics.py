@@ -11,13 +11,8 @@ from typer.testing import CliRunner
 
 from dpcli.cli.app import app
 from dpcli.errors import DataError
-from dpcli.evaluate.segmentation.motion_metrics import (
-    FlowShares,
-    flow_update,
-    motion_compute,
-    motion_merge,
-    part_motion_update,
-)
+from dpcli.evaluate.results import merge_statistics
+from dpcli.evaluate.segmentation.motion_metrics import FlowShares, flow_update, motion_compute, part_motion_update
 from dpcli.evaluate.segmentation.rigid_motion import rotation_angle, true_flow, true_motion
 from tests.support.parts_helpers import CHAIN, perfect, rigid, rotation, truth_sequence, write_parts, write_truth
 
@@ -29,7 +24,7 @@ def test_golden_cases_of_the_published_code(golden_file) -> None:
     cases = sorted({key[:6] for key in arrays})
     for case in cases:
         pairs = zip(arrays[f"{case}_pred_flow"], arrays[f"{case}_gt_flow"], strict=True)
-        metrics = motion_compute(motion_merge(flow_update(*pair) for pair in pairs))
+        metrics = motion_compute(merge_statistics(flow_update(*pair) for pair in pairs))
         found = metrics.shares[float(arrays[f"{case}_epe_norm_thresh"])]
         values = [metrics.epe3d, found.accs, found.accr, found.outlier]
         np.testing.assert_allclose(values, arrays[f"{case}_flow_scores"], atol=TOLERANCE, err_msg=case)
@@ -71,20 +66,20 @@ def test_every_point_counts_the_same_and_batches_are_the_published_way() -> None
     """Seven pairs of error 1, the last of error 8: published, the last batch of one pair weighs as much as six."""
     truth = np.zeros((4, 3))
     pairs = [flow_update(truth + [error, 0, 0], truth) for error in (1, 1, 1, 1, 1, 1, 8)]
-    merged = motion_merge(pairs)
+    merged = merge_statistics(pairs)
     assert motion_compute(merged).epe3d == pytest.approx(14 / 7)
     assert motion_compute(merged, batch=6).epe3d == pytest.approx((1 + 8) / 2)
-    ragged = motion_merge([flow_update(np.ones((30, 3)), np.zeros((30, 3))), flow_update(truth[:2], truth[:2])])
+    ragged = merge_statistics([flow_update(np.ones((30, 3)), np.zeros((30, 3))), flow_update(truth[:2], truth[:2])])
     assert motion_compute(ragged).epe3d == pytest.approx(30 * np.sqrt(3) / 32)
 
 
 def test_shards_add_up_exactly() -> None:
     rng = np.random.default_rng(2)
     pairs = [flow_update(*rng.normal(size=(2, n, 3))) for n in (5, 9, 1, 30, 2)]
-    whole = motion_compute(motion_merge(pairs))
-    assert motion_compute(motion_merge(pairs[:2]) + motion_merge(pairs[2:])).shares == whole.shares
+    whole = motion_compute(merge_statistics(pairs))
+    assert motion_compute(merge_statistics(pairs[:2]) + merge_statistics(pairs[2:])).shares == whole.shares
     with pytest.raises(DataError, match="no statistics"):
-        motion_merge([])
+        merge_statistics([])
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 2.0, np.pi])

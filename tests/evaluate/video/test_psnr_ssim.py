@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video import ssim as ssim_module
-from dpcli.evaluate.video.picture_statistics import picture_compute, picture_merge, picture_update
+from dpcli.evaluate.video.picture_statistics import picture_compute, picture_update
 from dpcli.evaluate.video.psnr import PSNR_CAP, planar, psnr
 from dpcli.evaluate.video.ssim import ms_ssim, ssim, ssim_reference
 
@@ -165,8 +166,8 @@ def test_shards_merge_to_the_whole() -> None:
     mask = (rng.random((20, 24)) < 0.4).astype(np.uint8)
     mask_of = [mask, np.zeros_like(mask), *[mask] * 5]
     rows = [picture_update(i, frames[2 * i], frames[2 * i + 1], mask=mask_of[i]) for i in range(7)]
-    whole = picture_compute(picture_merge(rows))
-    shards = picture_compute(picture_merge(rows[:3]) + picture_merge(rows[3:]))
+    whole = picture_compute(merge_statistics(rows))
+    shards = picture_compute(merge_statistics(rows[:3]) + merge_statistics(rows[3:]))
     assert replace(shards, ms_ssim=0, silhouette_iou=0) == replace(whole, ms_ssim=0, silhouette_iou=0)
     each = [psnr(*(np.moveaxis(f, 0, -1) for f in frames[2 * i : 2 * i + 2])) for i in range(7)]
     assert whole.psnr == pytest.approx(np.mean(each)) and whole.worst == int(np.argmin(each))
@@ -201,6 +202,6 @@ def test_silhouettes_overlap_by_hand_and_empty_frames_do_not_count():
     truth[1, :, :1] = 1  # nothing predicted: 0; the last frame is empty in both
     blank = np.zeros((3, 4, 4), np.float32)
     rows = [picture_update(i, blank, blank, mask=truth[i], predicted_mask=said[i], metrics=("psnr",)) for i in range(3)]
-    assert picture_compute(picture_merge(rows)).silhouette_iou == pytest.approx((1 / 3 + 0) / 2)
+    assert picture_compute(merge_statistics(rows)).silhouette_iou == pytest.approx((1 / 3 + 0) / 2)
     unasked = picture_compute(picture_update(0, blank, blank, mask=truth[0], metrics=("psnr",)))
     assert np.isnan(unasked.silhouette_iou)

@@ -252,6 +252,8 @@ def test_frames_missing_empty_and_misnamed(tmp_path):
     sample = only(NTU60((write_files(tmp_path, files),)))
     assert sample.notes == {"frames without points dropped": 1, "frames missing in the numbering from 1": 3}
     np.testing.assert_allclose(sample.sequence.time, [0, 3 / 30])
+    from_0 = only(NTU60((write_files(tmp_path / "from_0", ntu_files(ONE, person(0, 4), first=0)),)))
+    assert from_0.notes == {}
     other = write_files(tmp_path / "full", {f"{TWO}/Depth-00000001.png": png_bytes(depth[0])})
     with pytest.raises(DataError, match=r"no MDepth-00000001.png ...; found Depth-00000001.png; the masked"):
         only(NTU60((other,)))

@@ -89,6 +89,13 @@ def test_frames_of_equal_size_are_read_as_well(tmp_path):
         np.testing.assert_allclose(points.reshape(3, 20, 3) * 300, clouds, rtol=1e-5, atol=1e-4)
 
 
+def test_names_in_capitals_are_read_as_well(tmp_path):
+    with (tmp_path / "A01_S02_E03_SDEPTH.NPZ").open("wb") as file:
+        np.savez(file, point_clouds=np.ones((2, 4, 3)))
+    (item,) = open_preprocessed(tmp_path).items()
+    assert (item.name, item.label, item.subject) == ("a01_s02_e03", 0, 2) and not item.problem
+
+
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
 def test_pickles_of_every_protocol(tmp_path, protocol):
     frames = peer_clouds(make_depth(0, 3).astype(np.float64), 8, 6)

@@ -382,6 +382,8 @@ def test_kinds_differ_and_so_do_their_objects():
     for number in range(len(KINDS)):
         a, b = (build_object(0, number + k * len(KINDS), KIND_NAMES) for k in (0, 1))
         assert a.triangles.shape != b.triangles.shape or (a.triangles != b.triangles).any()
+    with pytest.raises(UsageError, match="--kinds door,lamp,door: a kind is named twice"):
+        SyntheticArticulated(kinds=("door", "lamp", "door"))
     with pytest.raises(UsageError, match="--kinds boat: not known"):
         SyntheticArticulated(kinds=("boat",))
 

@@ -7,10 +7,11 @@ import pytest
 
 from dpcli.cli.prepare.articulated.ogc import NewRoomOptions, RoomConversion, ogc_dr
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.articulated.articulated_object import triangle_areas
 from dpcli.prepare.articulated.articulated_sequence import random_rotation
 from dpcli.prepare.articulated.ogc import OgcRooms, read_room
 from dpcli.prepare.articulated.ogc_layout import GROUND, RoomMotion, box, draw_layout, overlaps, scale_range
-from dpcli.prepare.articulated.ogc_meshes import areas, find_meshes, load_shape
+from dpcli.prepare.articulated.ogc_meshes import find_meshes, load_shape
 from dpcli.prepare.articulated.ogc_rooms import GeneratedRooms, RoomOptions, seen_by_camera
 from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
 from dpcli.runtime.seeds import generator
@@ -272,7 +273,7 @@ def test_single_view_shows_no_hidden_surface(meshes):
     seen = points_on(placed, seen_by_camera(placed))
     few = seen[generator(0).permutation(len(seen))[:200]]
     assert not hidden(eye, few, placed).any()
-    whole = points_on(placed, choose_on_surface(areas(placed), 200, generator(0)))
+    whole = points_on(placed, choose_on_surface(triangle_areas(placed), 200, generator(0)))
     assert hidden(eye, whole, placed).mean() > 0.3
 
 

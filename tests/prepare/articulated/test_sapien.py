@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.articulated_sequence import Articulation, study
+from dpcli.prepare.articulated.articulated_sequence import Articulation, draw_sequence, study
 from dpcli.prepare.articulated.sapien import Sapien, find_objects
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
 from dpcli.runtime.seeds import generator
@@ -136,6 +136,16 @@ def test_mimic_joints_follow(tmp_path):
     assert [(own.lower, own.upper) for own in fixed.joints] == [
         pytest.approx((-0.9, -0.9))
     ]  # -2 x the leader's value + 0.1
+
+
+@pytest.mark.parametrize(("kind", "limits"), [("revolute", "0 1"), ("prismatic", "")])
+def test_a_slide_without_limits_that_follows_a_joint_has_its_range(tmp_path, kind, limits):
+    follower = joint("k", "a", "c", kind="prismatic", limits="", more='<mimic joint="j" multiplier="-2" offset="0.1"/>')
+    studied = study(load(two(tmp_path, link("c", box(1, 1, 1)), follower, kind=kind, limits=limits)), Articulation())
+    leader, own = studied.obj.joints
+    assert np.isfinite(leader.upper) and (own.lower, own.upper) == pytest.approx((0.1 - 2 * leader.upper, 0.1))
+    pose = draw_sequence("s", studied, Articulation(), 3, generator(0)).sequence.pose
+    assert np.isfinite(pose).all()
 
 
 @pytest.mark.parametrize(

@@ -117,8 +117,8 @@ def test_a_misspelled_split_is_told(tmp_path, whole, capsys):
 
 def test_into_one_file_with_new_splits(whole, tmp_path):
     choice = SplitChoice(fractions=(0.5, 0.25, 0.25), seed=3)
-    split(whole, tmp_path / "new.h5", choice)
-    with CloudsReader(tmp_path / "new.h5") as reader:
+    split(whole, tmp_path / "new.H5", choice)
+    with CloudsReader(tmp_path / "new.H5") as reader:
         assert list(reader.names) == [f"s{k:02}" for k in range(12)]
         assert Counter(reader.splits) == {"train": 6, "validation": 3, "test": 3}
         per_class = {(split_name, label): 0 for split_name in ("train", "validation", "test") for label in range(3)}
@@ -127,15 +127,15 @@ def test_into_one_file_with_new_splits(whole, tmp_path):
         assert sorted(per_class.values()) == [1] * 6 + [2] * 3  # stratified: each class 2, 1, 1
     other = SplitChoice(fractions=(0.5, 0.25, 0.25), seed=4)
     split(whole, tmp_path / "other.h5", other)
-    with CloudsReader(tmp_path / "new.h5") as one, CloudsReader(tmp_path / "other.h5") as two:
+    with CloudsReader(tmp_path / "new.H5") as one, CloudsReader(tmp_path / "other.h5") as two:
         assert list(one.splits) != list(two.splits)
     with pytest.raises(UsageError, match="exists, made with"):
-        split(whole, tmp_path / "new.h5", other)
+        split(whole, tmp_path / "new.H5", other)
 
 
 def test_subjects_stay_together(whole, tmp_path):
-    split(whole, tmp_path / "new.h5", SplitChoice(fractions=(0.5, 0.25, 0.25), by_subject=True))
-    with CloudsReader(tmp_path / "new.h5") as reader:
+    split(whole, tmp_path / "new.H5", SplitChoice(fractions=(0.5, 0.25, 0.25), by_subject=True))
+    with CloudsReader(tmp_path / "new.H5") as reader:
         where = {(int(subject), split_name) for subject, split_name in zip(reader.subjects, reader.splits)}
     assert len(where) == 4 and Counter(split_name for _, split_name in where) == {
         "train": 2,

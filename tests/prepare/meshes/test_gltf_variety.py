@@ -523,6 +523,11 @@ def test_one_odd_clip_does_not_end_the_others(tmp_path, capsys):
         clip_outputs(file.write(path), "v.h5")
 
 
+def test_clips_of_one_file_name_get_a_file_each(tmp_path):
+    path = named("Walk", "walk", "Walk_0").write(tmp_path / "m.glb")
+    assert [file for _, file in clip_outputs(path, "v.h5")] == ["v_Walk_0_.h5", "v_walk_1.h5", "v_Walk_0.h5"]
+
+
 def test_keys_joined_in_an_unknown_way_are_refused(tmp_path):
     file = quad(shift=1.0)
     file.tree["animations"][0]["samplers"][0]["interpolation"] = "BEZIER"

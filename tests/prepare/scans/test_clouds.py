@@ -346,6 +346,12 @@ def test_columns_that_are_not_read_are_named(tmp_path):
     assert reader.summary(reader.items())[0] == "1 sequence of 1 frames found; not read: columns 4 to 6 (no names)"
 
 
+def test_columns_that_would_be_one_data_set_are_refused(tmp_path):
+    (tmp_path / "0.csv").write_text("x,y,z,v/s,v_s\n1,2,3,4,5\n1,2,4,4,5\n")
+    with pytest.raises(UsageError, match="v/s and v_s would both be kept as field_v_s"):
+        _ = CloudFolders(tmp_path, keep=("v/s", "v_s")).fields
+
+
 def test_pictures_of_depth_are_sent_to_the_command_that_reads_them(tmp_path):
     (tmp_path / "v").mkdir()
     for k in range(3):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from dpcli.store import CloudSequence, CloudsWriter
 from tests.support.drawers import TRAIN
 
 
@@ -24,3 +27,12 @@ def test_a_flow_estimator_is_trained_and_used(dpc_here, one_thread, data, tmp_pa
     assert other.returncode == 2 and b"exists, made with another flow file" in other.stderr
     other = dpc_here(*learn)
     assert other.returncode == 2 and b"another configuration (flow_weights" in other.stderr, other.stderr
+
+
+def test_nothing_is_learned_from_what_is_held_out(dpc_here, tmp_path):
+    frames = list(np.random.default_rng(0).random((2, 40, 3), np.float32))
+    with CloudsWriter(tmp_path / "c.h5", class_names=[], length_unit="m") as writer:
+        for split in ("validation", "test"):
+            writer.write(CloudSequence.from_frames(split, frames, split=split))
+    done = dpc_here("segment", "flow", tmp_path / "c.h5", "-o", tmp_path / "flow", "--steps", 1)
+    assert done.returncode == 3 and b"no sequence of split 'train', or without a split" in done.stderr

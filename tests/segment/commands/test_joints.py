@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.segment.commands.joints import find_joints
-from dpcli.store import CloudsReader, PartsReader, PartsWriter
+from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code
 
@@ -126,6 +127,52 @@ def test_a_folder_holds_one_object_for_each_sequence(few, tmp_path, dpc_here):
     assert set(names[1:]) < set(found) and names[0] + "\\x1b[31m\\n" in found.values() and len(found) == len(names)
 
 
+def test_sequences_whose_names_are_one_file_name_have_a_file_each(few, tmp_path):
+    with h5py.File(shutil.copyfile(few, tmp_path / "odd.h5"), "r+") as file:
+        file["name"][:2] = ["a/b", "a:b"]
+    find_joints(str(tmp_path / "odd.h5"), tmp_path / "robots", sequence=None, picture=None, force=False)
+    names = {ElementTree.parse(path).getroot().get("name") for path in (tmp_path / "robots").glob("*.urdf")}
+    assert names == {"a/b", "a:b"}
+
+
+def test_a_urdf_is_in_meters_whatever_the_clouds_are_in(few, tmp_path, dpc_here):
+    """The JSON keeps the file's own unit."""
+    with h5py.File(shutil.copyfile(few, tmp_path / "mm.h5"), "r+") as file:
+        name, file.attrs["length_unit"] = file["name"][0].decode(), "mm"
+        file["points"][:] = 1000 * file["points"][:]
+        file["part_motion"][..., :3, 3] = 1000 * file["part_motion"][..., :3, 3]
+    for parts, output in ((few, "m"), (tmp_path / "mm.h5", "mm")):
+        for suffix in (".urdf", ".json"):
+            done = dpc_here("segment", "joints", parts, "-o", tmp_path / f"{output}{suffix}", "--sequence", name)
+            assert done.returncode == 0, done.stderr
+    one, other = (ElementTree.parse(tmp_path / f"{unit}.urdf").getroot() for unit in ("m", "mm"))
+    for path, key in (("joint/origin", "xyz"), ("joint/limit", "upper")):
+        found = [[list(map(float, item.get(key).split())) for item in robot.iterfind(path)] for robot in (one, other)]
+        assert found[0] and np.allclose(*found, atol=1e-3)
+    meshes = [(tmp_path / f"{unit}_meshes" / "part_0.obj").read_text().splitlines() for unit in ("m", "mm")]
+    widths = [max(float(line.split()[1]) for line in lines if line.startswith("v ")) for lines in meshes]
+    assert np.isclose(*widths, atol=1e-3)
+    assert json.loads((tmp_path / "mm.json").read_text())[0]["length_unit"] == "mm"
+
+
+def test_points_that_lie_on_one_another_have_joints_without_certainty(tmp_path):
+    frames, still = [np.zeros((60, 3), np.float32)] * 3, np.tile(np.eye(4, dtype=np.float32), (2, 2, 1, 1))
+    cloud = CloudSequence.from_frames("same", frames, part=[np.repeat([0, 1], 30)] * 3)
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, class_names=[], length_unit="m") as writer:
+        share, flow = np.eye(2, dtype=np.float32)[cloud.part], [np.zeros((60, 3), np.float32)] * 2
+        writer.write(cloud, share, np.array([(0, 1), (1, 2)]), still, flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
+    assert len(json.loads((tmp_path / "j.json").read_text())[0]["joints"]) == 1
+
+
+def test_one_frame_has_no_joints(tmp_path):
+    cloud = CloudSequence.from_frames("still", [np.eye(3, dtype=np.float32)], part=[np.arange(3)])
+    with PartsWriter(tmp_path / "p.h5", num_parts=3, class_names=[], length_unit="m") as writer:
+        writer.write(cloud, np.eye(3, dtype=np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 3, 4, 4)), [])
+    with pytest.raises(DataError, match="'still': one frame only, which shows no motion"):
+        find_joints(str(tmp_path / "p.h5"), tmp_path / "p.json", sequence=None, picture=None, force=False)
+
+
 def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatch):
     """Else the same command, which a full disk's sentence asks for, would be refused for what it had left."""
 
@@ -147,6 +194,7 @@ def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatc
     ("words", "code", "message"),
     [
         (["-o", "a.urdf"], 2, "name one with --sequence"),
+        (["-o", "a.URDF"], 2, "name one with --sequence"),
         (["-o", "a.urdf", "--sequence", "nobody"], 2, "--sequence nobody: not in"),
         (["-o", "a.xml"], 2, "expected a name that ends in .h5, .urdf, .json, or a folder"),
     ],

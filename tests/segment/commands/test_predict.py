@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.parts import PartsReader
 
 
@@ -41,6 +42,18 @@ def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path,
     assert done.returncode == 0, done.stderr.decode()
     with PartsReader(tmp_path / "p.h5") as reader:
         assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
+
+
+def test_no_name_in_a_file_leads_out_of_the_folder_of_ply_files(dpc_here, tmp_path):
+    """Nor do two names share a folder."""
+    names, cloud = ["..", "a/b", "a_b"], np.random.default_rng(0).random((20, 3), np.float32)
+    with CloudsWriter(tmp_path / "c.h5", class_names=[], length_unit="m") as writer:
+        for name in names:
+            writer.write(CloudSequence.from_frames(name, [cloud]))
+    done = dpc_here("segment", "predict", tmp_path / "c.h5", "-o", tmp_path / "p.h5", "--ply", tmp_path / "ply")
+    assert done.returncode == 0, done.stderr.decode()
+    found = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.ply") if path.is_file())
+    assert found == ["ply/a_b_1/0000.ply", "ply/a_b_2/0000.ply", "ply/object/0000.ply"]
 
 
 def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, monkeypatch):

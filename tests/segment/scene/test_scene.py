@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from functools import lru_cache
@@ -9,12 +10,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.prepare.synthetic.spinning_lidar import Lidar, scan
 from dpcli.prepare.synthetic.street_world import Mover, car, person, planar_pose, standing_street
 from dpcli.segment.scene.clusters import cluster
 from dpcli.segment.scene.ego_motion import register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import LineOfSight, range_jumps
+from dpcli.segment.scene.report import picture_of_scene
 from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.store import CloudSequence, CloudsWriter
@@ -103,6 +106,7 @@ SAME = {  # input that must be answered as the plain street is
     "y up": (turned, {}, "m"),
     "kilometers away": (lambda frames: frames, {"shift": np.array([4.5e5, 5.4e6, 120.0])}, "m"),
     "millimeters": (lambda frames: [1000 * frame for frame in frames], {}, "mm"),
+    "inches": (lambda frames: [frame / 0.0254 for frame in frames], {}, "in"),
     "wrong time order": (lambda f: [f[2], f[0], f[1]], {"time": np.array([0.2, 0.0, 0.1])}, "m"),
     "duplicates": (lambda frames: [np.concatenate([frame, frame[::2]]) for frame in frames], {}, "m"),
     "sizes differ": (lambda f: [f[0], f[1][::3], f[2]], {}, "m"),
@@ -191,6 +195,21 @@ def test_the_command_writes_a_parts_file_and_a_line_to_check(dpc_here, tmp_path)
     assert picture.stat().st_size > 1000
     done = dpc_here("evaluate", "segmentation", parts, "--truth", data, "--split", "all", "--json")
     assert json.loads(done.stdout)["metrics"]["f1"] > 0.9
+
+
+def test_points_farther_apart_than_on_earth_are_no_scene():
+    far = CloudSequence.from_frames("f", [np.random.default_rng(t).random((50, 3)) * 1e11 for t in range(2)])
+    with pytest.raises(DataError, match=r"m apart, .* --unit \(the file's is m\)"):
+        SceneSegmenter(SceneSettings()).explain(far, [(0, 1)], "m")
+
+
+def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
+    cloud = street().frame(0)
+    sequence = CloudSequence.from_frames("s", [cloud[:0], cloud], part=[np.zeros(0, int), np.zeros(len(cloud), int)])
+    count = len(picture_of_scene(copy.copy(sequence), "m")[0].points)
+    sequence.points = 1000 * sequence.points
+    shown, look = picture_of_scene(sequence, "mm")
+    assert look.up == "z" and shown.frame_offsets[1] == 0 < len(shown.points) == count
 
 
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
