@@ -187,7 +187,7 @@ def test_what_an_index_cannot_hold_is_a_bad_sample(what):
         def read(self, item, rng):
             return replace(made, sequence=replace(made.sequence, **what))
 
-    with pytest.raises(DataError, match="sample .*(too large|NUL)"):
+    with pytest.raises(DataError, match="sample .*(expected -1 .unknown. or 0 to 2147483647|too large|NUL)"):
         convert_item(Odd(), Thinning(0), 0, (0, item))
 
 

@@ -45,7 +45,7 @@ def test_all_settings_are_listed_with_help_and_default(capsys):
     listed = capsys.readouterr().out
     for name, setting in TRAINING.settings.items():
         assert f"\n  {name} " in listed and setting.help[-1] in ".)", name
-    assert "[default: thesis 0; release, quick, tiny" in " ".join(listed.split())
+    assert "[default: thesis 0; release, quick, long, tiny" in " ".join(listed.split())
 
 
 def test_help_of_training_loads_no_torch():
@@ -61,7 +61,7 @@ def test_help_of_training_loads_no_torch():
         (("train", "--set", "decay=foo"), "decay = foo: expected one of cosine, staircase, constant"),
         (("train", "--epochs", "-1"), "epochs = -1: expected at least 0"),
         (("train", "--set", "epochs=1", "--epochs", "2"), "epochs is given twice, by --epochs and by --set"),
-        (("train", "--preset", "quik"), "preset = quik: expected one of thesis, release, quick, tiny"),
+        (("train", "--preset", "quik"), "preset = quik: expected one of thesis, release, quick, long, tiny"),
         (("profile", "--set", "reduction=2"), "reduction = 2: expected a number above 0 and at most 1"),
         (("profile", "--set", "lr=0.1"), "unknown setting lr"),
         (("explain", "pac", "--set", "rule=gradiant"), "rule = gradiant: expected one of activation, gradient"),
