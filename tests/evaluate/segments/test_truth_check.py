@@ -32,7 +32,8 @@ def doubts(predicted: dict, true: dict) -> str:
 @given(LENGTHS, st.data())
 def test_frames_that_count_as_ours_are_not_doubted(lengths, data):
     true = recordings(lengths)
-    kept = {name: [row for k, row in enumerate(rows) if k % 3 != 2] for name, rows in true.items()}
+    # without some in between: one that ends early in all recordings is doubted, and rightly
+    kept = {name: [row for k, row in enumerate(rows) if k % 3 != 1 or row is rows[-1]] for name, rows in true.items()}
     assert not doubts(true, data.draw(st.sampled_from([true, kept])))
 
 
