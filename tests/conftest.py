@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import hypothesis
+import numpy as np
 import pytest
 
 from dpcli.store import CloudSequence
@@ -95,6 +95,6 @@ def make_sequence() -> Callable[..., CloudSequence]:
     return make
 
 
-# the same examples in every run: a suite that fails by the draw tells its reader nothing; --hypothesis-seed and `make fuzz` try others
+# the same examples in every run (--hypothesis-profile default draws others): a suite that fails by the draw tells its reader nothing
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("suite")
