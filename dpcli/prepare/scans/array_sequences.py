@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
@@ -21,7 +21,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
-from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden
 from dpcli.store.schema import kept_names
@@ -61,7 +61,7 @@ def _is_array(name: str) -> bool:
 
 
 @dataclass(frozen=True)
-class ArraySequences:
+class ArraySequences(OwnScans):
     """Reads arrays of many clouds. axes: their letters, as `axes.check_axes` has them, "" where shapes and values tell; the
     rest as `CloudFolders` has it.
     """
@@ -78,33 +78,14 @@ class ArraySequences:
     pattern: str = ""
 
     def __post_init__(self) -> None:
-        if self.labels and self.label_from_folder:
-            raise UsageError("--labels and --label-from-folder were both given; use one")
-        if self.fps is not None and not self.fps > 0:
-            raise UsageError("--scale and --fps must be more than 0")
+        self.check_options()
         object.__setattr__(self, "axes", check_axes(self.axes))
-        Lengths(self.scale, self.unit)
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
-
-    @property
-    def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
-        return self.unit
 
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
         time, color = self._first
         return (("time",) if time else ()) + (("color",) if color else ()) + kept_names(self.keep)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
 
     @cached_property
     def _paths(self) -> dict[str, Path]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
+from dpcli.prepare.labels import LabelTable
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
@@ -52,6 +55,45 @@ class Lengths:
         (name,) = declared
         note = f"sequences converted from {name} to {self.unit}, as their files declare"
         return METERS[self.unit] / METERS[name], {note: 1}
+
+
+class OwnScans:
+    """Holds what the readers of people's own scans share, whose dataclass fields these are: one check of their options, the
+    classes of their table of labels, the unit, and what the provenance tells.
+    """
+
+    scale: float | None
+    unit: str
+    fps: float | None
+    label_from_folder: bool
+    labels: Path | None
+    _table: LabelTable | None
+
+    def __post_init__(self) -> None:
+        self.check_options()
+
+    def check_options(self) -> None:
+        """Raises UsageError for options that exclude each other, or a scale or a rate that is no positive number."""
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+        Lengths(self.scale, self.unit)
+
+    @property
+    def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
+        return self._table.class_names if self._table else []
+
+    @property
+    def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
+        return self.unit
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
 
 
 def assemble(

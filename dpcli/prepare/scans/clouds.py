@@ -16,7 +16,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, require_folder
-from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
 from dpcli.prepare.series import Series, about_series
 from dpcli.store.schema import kept_names
@@ -26,7 +26,7 @@ _LOOKED_AT = 5  # frames that tell how many columns a .bin has
 
 
 @dataclass(frozen=True)
-class CloudFolders:
+class CloudFolders(OwnScans):
     """Reads point cloud files. ``scale``: input units per unit of length in the output; ``keep``: further columns."""
 
     raw: Path
@@ -41,23 +41,9 @@ class CloudFolders:
     pattern: str = ""
 
     def __post_init__(self) -> None:
-        if self.labels and self.label_from_folder:
-            raise UsageError("--labels and --label-from-folder were both given; use one")
-        if self.fps is not None and not self.fps > 0:
-            raise UsageError("--scale and --fps must be more than 0")
+        self.check_options()
         if self.bin_columns is not None and self.bin_columns < 3:
             raise UsageError(f"--bin-columns {self.bin_columns}: expected 3 (x y z) or more")
-        Lengths(self.scale, self.unit)
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
-
-    @property
-    def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
-        return self.unit
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.cloud import without
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
@@ -17,15 +16,15 @@ from dpcli.prepare.reader import Item, Sample
 from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, open_recording
 from dpcli.prepare.recordings.topic_frames import read_topic
-from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.store.schema import KEPT
+from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.store.schema import kept_names
 
 _WANTED = "clouds (PointCloud2, or CustomMsg of Livox)"
 _LISTED = 8
 
 
 @dataclass(frozen=True)
-class RecordedClouds:
+class RecordedClouds(OwnScans):
     """Reads the clouds of ``topic`` in a recording, or in those below a folder; the rest as `CloudFolders` has it."""
 
     raw: Path
@@ -38,32 +37,10 @@ class RecordedClouds:
     labels: Path | None = None
     keep: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.labels and self.label_from_folder:
-            raise UsageError("--labels and --label-from-folder were both given; use one")
-        if self.fps is not None and not self.fps > 0:
-            raise UsageError("--scale and --fps must be more than 0")
-        Lengths(self.scale, self.unit)
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
-
-    @property
-    def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
-        return self.unit
-
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has: time, color when the very first cloud has it, what is kept."""
-        return ("time", *(("color",) if self._has_color else ()), *(f"{KEPT}{name}" for name in self.keep))
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+        return ("time", *(("color",) if self._has_color else ()), *kept_names(self.keep))
 
     @cached_property
     def _names(self) -> dict[str, Path]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from dpcli.prepare.cloud_formats.text_numbers import read_text_table
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
-from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
@@ -31,7 +30,7 @@ _FEW = 5  # frames of one point that may be true
 
 
 @dataclass(frozen=True)
-class TableSequences:
+class TableSequences(OwnScans):
     """Reads one table, or those of a folder. frame_column: "" for the one whose name says it; the rest as `CloudFolders`
     and `split_rows` have it.
     """
@@ -49,23 +48,9 @@ class TableSequences:
     keep: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.labels and self.label_from_folder:
-            raise UsageError("--labels and --label-from-folder were both given; use one")
-        if self.fps is not None and not self.fps > 0:
-            raise UsageError("--scale and --fps must be more than 0")
+        self.check_options()
         if self.gap is not None and not self.gap > 0:
             raise UsageError(f"--gap {self.gap:g}: expected more than 0, in the numbers of the frame column")
-        Lengths(self.scale, self.unit)
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return self._label_table.class_names if self._label_table else []
-
-    @property
-    def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
-        return self.unit
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -73,11 +58,6 @@ class TableSequences:
         kept = kept_names(self.keep)
         color, time = self._found
         return (("time",) if time else ()) + (("color",) if color else ()) + kept
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
 
     @cached_property
     def _paths(self) -> dict[str, Path]:
@@ -112,7 +92,7 @@ class TableSequences:
         return False, bool(self.fps)
 
     @cached_property
-    def _label_table(self) -> LabelTable | None:
+    def _table(self) -> LabelTable | None:
         if self.labels:
             return read_labels(self.labels)
         names = [item.name for item in self._items]
@@ -135,7 +115,7 @@ class TableSequences:
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        return self._label_table.apply(self._items) if self._label_table else self._items
+        return self._table.apply(self._items) if self._table else self._items
 
     def _load(self, path: Path) -> Loaded:
         facts = path.stat()
@@ -174,7 +154,7 @@ class TableSequences:
             if clock:
                 lines[0] += f", times by column {' and '.join(map(repr, clock))}"
             lines[0] += f"; not read: {unused} (--keep-fields)" if unused else ""
-        return lines + (self._label_table.unnamed(items) if self._label_table else [])
+        return lines + (self._table.unnamed(items) if self._table else [])
 
 
 @dataclass(frozen=True)
