@@ -29,12 +29,14 @@ _BOTH_SIGNS = 0.1  # of a column's values at least above and below 0: it is a sp
 SPARSE = 64  # points of a frame in the median, at most: what common radars send
 LONG = 4  # clips that the median video holds, at least, where a single one may show nothing of its class
 _OWN_CHOICE = ("backbone", "timing", "variant", "init", "static_from", "pretrain")  # settings that name another network
+_OWN_BATCHES = ("batch", "accumulate", "clips_per_video", "video_loss")  # those that `long` chooses together
 
 
 def preset_for(reader: CloudsReader, given: Mapping[str, Any]) -> str:
     """Returns the preset that suits a file: `sparse` for sparse clouds, `long` for videos of `LONG` clips or more, else `quick`.
 
-    given: the values of settings that were given, by name; where they name another network, `quick` it is.
+    given: the values of settings that were given, by name; where they name another network, `quick` it is, and not `long`
+    where they say which clips make a step.
     """
     sizes, lengths = reader.frame_sizes, reader.frame_counts
     if not len(sizes) or any(given.get(name) for name in _OWN_CHOICE):
@@ -42,7 +44,8 @@ def preset_for(reader: CloudsReader, given: Mapping[str, Any]) -> str:
     if float(np.median(sizes)) <= SPARSE:
         return "sparse"
     frames = int(given.get("frames") or PRESETS["quick"]["network"].num_frames)
-    return "long" if float(np.median(lengths)) >= LONG * frames else "quick"
+    long = float(np.median(lengths)) >= LONG * frames and not any(name in given for name in _OWN_BATCHES)
+    return "long" if long else "quick"
 
 
 def measured(config: KinetConfig, reader: CloudsReader, sequences: list[int]) -> tuple[KinetConfig, dict[str, str]]:

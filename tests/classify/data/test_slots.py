@@ -213,6 +213,11 @@ def test_the_data_choose_the_preset_unless_another_network_is_named(tmp_path):
         and preset_for(dense, {"frames": length // 4 + 1}) == "quick"
     )
     assert preset_for(dense, {"frames": 1, "timing": "uniform"}) == "quick"
+    assert (
+        preset_for(dense, {"frames": 1, "batch": 6})
+        == preset_for(dense, {"frames": 1, "clips_per_video": 0})
+        == "quick"
+    )
 
 
 def test_a_file_without_the_columns_is_refused(tmp_path):
