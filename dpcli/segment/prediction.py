@@ -126,7 +126,7 @@ def _find_masks_and_motions(
     """
     if isinstance(segmenter, MultibodySegmenter):
         with torch_threads(1):
-            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks)
+            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks, tuple(-frames.scale * frames.center))
         return masks, [motions[pair] for pair in pairs]
     flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
     masks = _refine_masks(frames.thin, flows, masks, options)

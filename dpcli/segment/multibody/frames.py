@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.multibody.label_kernels import alike_kernel, displacement_kernel, gain_kernel, row_length
+from dpcli.segment.multibody.visibility import DepthMap
 
 _PARTNERS = 6  # other frames that a point is compared with, so that the cost stays linear in frames
 POINT_SHARE = 0.15  # of point-to-point distance in a residual, besides point to plane
@@ -21,7 +24,10 @@ class Frames:
     """Holds the surfaces of F frames, N points in all, and their neighbors inside a frame.
 
     `partners`: for each frame, the equally many frames that its points are compared with, the nearest in time first.
+    `depth_maps`: of every frame, where it is known which camera saw it.
     """
+
+    depth_maps: list[DepthMap] | None = None
 
     def __init__(self, clouds: list[np.ndarray]) -> None:
         self.surfaces = [Surface(cloud) for cloud in clouds]
@@ -37,6 +43,12 @@ class Frames:
     def __len__(self) -> int:
         return len(self.surfaces)
 
+    def seen_by(self, camera: np.ndarray) -> Frames:
+        """Returns the same frames, seen by one camera (3,4): points that it can't see need no match."""
+        seen = copy(self)
+        seen.depth_maps = [DepthMap.of(surface.points, camera, self.spacing) for surface in self.surfaces]
+        return seen
+
     def slice(self, t: int) -> slice:
         """Returns where the points of frame t lie among all N."""
         return slice(int(self.starts[t]), int(self.starts[t + 1]))
@@ -50,16 +62,21 @@ class Frames:
     def explain(self, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
         """Returns costs f32 (N), 0..1, of all points under one trajectory, and the nearest points i32 (N,partners).
 
-        A cost is the mean over partner frames of Geman and McClure's d^2 / (d^2 + s^2), where d is the residual.
+        A cost is the mean over partner frames of Geman and McClure's d^2 / (d^2 + s^2), where d is the residual. Points that a
+        frame's camera could not see are judged as in `DepthMap.hide`.
         """
         cost = np.zeros(len(self.points), np.float32)
         nearest = np.zeros((len(self.points), self.partners.shape[1]), np.int32)
         for t, (others, motions) in enumerate(zip(self.partners, self.motions(trajectory))):
             own = self.slice(t)
+            points, total = self.surfaces[t].columns, cost[own]
             for column, (u, motion) in enumerate(zip(others, motions)):
-                scale = max(self.scales[t], self.scales[u])
-                out = cost[own], nearest[own, column]
-                self.surfaces[u].explain(self.surfaces[t].columns, motion, POINT_SHARE, scale, self.starts[u], *out)
+                scale, found = max(self.scales[t], self.scales[u]), nearest[own, column]
+                pair = total if self.depth_maps is None else np.zeros_like(total)
+                self.surfaces[u].explain(points, motion, POINT_SHARE, scale, self.starts[u], pair, found)
+                if self.depth_maps is not None:
+                    self.depth_maps[u].hide(points, motion, self.starts[t], pair, found)
+                    total += pair
             cost[own] /= len(others)
         return cost, nearest
 

@@ -11,6 +11,7 @@ from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.splits import split_bodies
+from dpcli.segment.multibody.viewpoint import find_camera
 
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
@@ -19,10 +20,19 @@ _SHOWN = 0.6  # share of the matches in other frames of a body's points that are
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
-def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings) -> Explanation:
-    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1."""
+def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings, origin: np.ndarray) -> Explanation:
+    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
+
+    origin (3): of the coordinates in which the frames were recorded. If one camera saw them, from there or elsewhere, points
+    that it can't see need no match.
+    """
     search = Search(Frames(clouds), settings)
-    found = turn_least(search.frames, search.run())
+    found = search.run()
+    camera = find_camera(search.frames, found, origin)
+    if camera is not None:
+        search = Search(search.frames.seen_by(camera), settings, search.hypotheses)
+        found = search.run()
+    found = turn_least(search.frames, found)
     return search.judged_anew(simplify_motions(search.frames, found))
 
 
@@ -31,8 +41,8 @@ class Search:
 
     def __init__(self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis] | None = None) -> None:
         self.frames, self.settings = frames, settings
-        hypotheses = find_hypotheses(frames) if hypotheses is None else hypotheses
-        self.pool = [body_of(frames, one.trajectory) for one in hypotheses]
+        self.hypotheses = find_hypotheses(frames) if hypotheses is None else hypotheses
+        self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
 
     def run(self) -> Explanation:
         """Returns the explanation: grown, pruned, grown anew without each body, split, and its motions tightened."""
