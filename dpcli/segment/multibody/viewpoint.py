@@ -12,6 +12,7 @@ from dpcli.segment.multibody.visibility import DepthMap
 _DIRECTIONS = 100  # tried, some 20 degrees apart
 _DISTANCES = (2.0, 1.5, 3.0, 6.0)  # diameters from the middle of all points
 _FINER = (0.18, 0.09, 0.05)  # radians around the best direction
+_OUTSIDE = 0.6  # diameters from the middle, beyond which the file's origin may be the camera
 _FRAMES = 4  # whose depth maps are drawn
 _POINTS = 1000  # badly explained points that are looked up in each of them
 _BAD = 0.5  # cost from which on a point is badly explained
@@ -28,15 +29,16 @@ def find_camera(frames: Frames, found: Explanation, origin: np.ndarray) -> np.nd
     sight. origin (3): of the file's coordinates, the place of the camera in clouds of a depth camera.
     """
     sight = _Sight(frames, found)
-    best = max([*(_DISTANCES[0] * _sphere(_DIRECTIONS)), origin - sight.middle], key=sight.score)
+    recorded = origin - sight.middle
+    if np.linalg.norm(recorded) > _OUTSIDE and sight.accepts(recorded):
+        return sight.camera(recorded)
+    best = max(_DISTANCES[0] * _sphere(_DIRECTIONS), key=sight.score)
     if sight.shares(best)[1] < _LEAST_HIDDEN / 2:
         return None
     for angle in _FINER:
         best = max([best, *_around(best, angle)], key=sight.score)
-    places = [best * (distance / _DISTANCES[0]) for distance in _DISTANCES]
-    best = max([*places, origin - sight.middle], key=sight.score)
-    behind, hidden, _ = sight.shares(best)
-    return sight.camera(best) if behind <= _MOST_BEHIND and hidden >= _LEAST_HIDDEN else None
+    best = max([best * (distance / _DISTANCES[0]) for distance in _DISTANCES], key=sight.score)
+    return sight.camera(best) if sight.accepts(best) else None
 
 
 class _Sight:
@@ -55,6 +57,11 @@ class _Sight:
         right /= max(float(np.linalg.norm(right)), 1e-9)
         axes = np.stack([right, np.cross(ahead, right), ahead])
         return np.concatenate([axes, -axes @ (self.middle + place)[:, None]], 1)
+
+    def accepts(self, place: np.ndarray) -> bool:
+        """Returns whether a camera there sees few points behind others, and not much of what is badly explained."""
+        behind, hidden, _ = self.shares(place)
+        return behind <= _MOST_BEHIND and hidden >= _LEAST_HIDDEN
 
     def score(self, place: np.ndarray) -> float:
         behind, hidden, open_ = self.shares(place)
