@@ -198,7 +198,8 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
     for axis, ends in found.get("range", {}).items():
         unit = found["length_unit"] if axis in "xyz" else ""
-        text = f"{ends[0]:.5g} to {ends[1]:.5g} {unit}".rstrip() if ends else "no finite values"
+        behind = f"({unit})" if " " in unit else unit  # `0.2 300 raw depth units` would read as two numbers
+        text = f"{ends[0]:.5g} to {ends[1]:.5g} {behind}".rstrip() if ends else "no finite values"
         lines.append((f"range {axis}", text))
     lines += _shift_lines(found.get("shifts", {}))
     for key in ("fields", "streams"):
