@@ -34,6 +34,7 @@ from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write_scene
+from dpcli.store.views import ViewsReader
 from dpcli.store.writing.already_made import already_made
 
 
@@ -102,6 +103,11 @@ def _load(path: Path, config: FitConfig, supervision: Supervision) -> Targets:
             f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
             " `dpc prepare video --views`, or use --prior none"
         )
+    if supervision.prior == "auto":
+        with ViewsReader(path) as reader:
+            unused = reader.header.role.count("train")
+        if unused:
+            log.info(f"{path}: {unused} of its views may be fitted to, too, but only --prior views does so")
     return targets
 
 
