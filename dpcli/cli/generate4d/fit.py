@@ -11,6 +11,7 @@ from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Picture, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.cli.spread_options import SpreadClips
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, PRESETS
 from dpcli.runtime.settings.catalog import Given
@@ -61,7 +62,7 @@ def _fit_many(views: list[str], folder: Path, *settings: Any, **options: Any) ->
     from dpcli.generate4d.commands.fit_clips import fit_clips
 
     fitted = fit_clips(views, folder, *settings, **options)
-    typer.echo(f"{folder}: {len(fitted.scenes)} scenes")
+    typer.echo(f"{folder}: {counted(len(fitted.scenes), 'scene')}")
     if fitted.failed:
         named = "; ".join(f"{views}: {reason}" for views, reason in fitted.failed[:5])
         raise DataError(f"{len(fitted.failed)} clips have no scene: {named}")

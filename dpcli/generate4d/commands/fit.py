@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, FitConfig, Supervision
 from dpcli.generate4d.fit import COLUMNS, FitRun
@@ -115,7 +116,7 @@ def _optimize(optimizer: SceneOptimizer, folder: RunFolder, settings: str) -> tu
     """Runs the fit in its folder; returns the model, on the CPU, and the numbers that the scene file tells of the fit."""
     targets, config = optimizer.targets, optimizer.config
     log.info(
-        f"fitting {targets.name} on {optimizer.device}: {targets.num_views} view(s) x {targets.num_frames} frames of"
+        f"fitting {targets.name} on {optimizer.device}: {counted(targets.num_views, 'view')} x {counted(targets.num_frames, 'frame')} of"
         f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
     )
     keep_freed_memory()
