@@ -16,6 +16,7 @@ COMMON = {
     "errors",
     "file_lock",
     "npy_files",
+    "counted",
     "path_names",
     "regular_files",
     "text_files",

@@ -184,8 +184,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     kind = f"{found['kind']}, schema {found['schema']}, {found['bytes'] / 1e6:.3g} MB"
     lines = [("file", found["file"]), ("kind", kind)]
     if "counts" in found:
-        counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in found["counts"].items())
-        lines.append(("counts", ", ".join(counts)))
+        lines.append(("counts", ", ".join(_count(*one) for one in found["counts"].items())))
     for key, unit in (
         ("frames_per_sequence", ""),
         ("points_per_frame", ""),
@@ -198,7 +197,8 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
     for axis, ends in found.get("range", {}).items():
         unit = found["length_unit"] if axis in "xyz" else ""
-        text = f"{ends[0]:.5g} to {ends[1]:.5g} {unit}".rstrip() if ends else "no finite values"
+        behind = f"({unit})" if " " in unit else unit  # `0.2 300 raw depth units` would read as two numbers
+        text = f"{ends[0]:.5g} to {ends[1]:.5g} {behind}".rstrip() if ends else "no finite values"
         lines.append((f"range {axis}", text))
     lines += _shift_lines(found.get("shifts", {}))
     for key in ("fields", "streams"):
@@ -218,6 +218,16 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         lines += [(name.replace("_", " "), f"{value:.4g}") for name, value in found["metrics"].items()]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+
+
+def _count(name: str, count: int) -> str:
+    """Returns a count with its noun, which `name` has in the plural.
+
+    >>> _count("part_slots", 2400), _count("views", 1), _count("classes", 1)
+    ('2,400 part slots', '1 view', '1 class')
+    """
+    noun = name.replace("_", " ")
+    return f"{count:,} {noun.removesuffix('es' if noun == 'classes' else 's') if count == 1 else noun}"
 
 
 def _shift_lines(shifts: dict[str, list[float]]) -> list[tuple[str, str]]:

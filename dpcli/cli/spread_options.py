@@ -27,6 +27,15 @@ Dask = Annotated[
         "--dask", metavar="ADDRESS", rich_help_panel=RUNNING, help="Work on a Dask cluster: tcp://HOST:PORT, or local."
     ),
 ]
+EachClip = Annotated[
+    str,
+    typer.Option(
+        "--shard",
+        metavar="I/N",
+        rich_help_panel=RUNNING,
+        help="Only every Nth clip, starting at I (0 to N-1); each scene is a file, so nothing has to be joined.",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -52,3 +61,10 @@ class SpreadOptions:
         from dpcli.runtime.machines import shards, spread
 
         return spread.Spread(self.jobs, shards.Shard.parse(self.shard) if self.shard else None, self.dask)
+
+
+@dataclass(frozen=True)
+class SpreadClips(SpreadOptions):
+    """Says who works on which clips, each of which becomes a file of its own."""
+
+    shard: EachClip = ""

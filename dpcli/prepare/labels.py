@@ -50,7 +50,7 @@ class LabelTable:
     def unnamed(self, items: list[Item]) -> list[str]:
         """Returns a line for the log about the samples that the table doesn't name; none when it names all."""
         names = [item.name for item in items if item.label < 0 and not item.problem]
-        return [f"{len(names)} without a label in {self.path}: {', '.join(names[:5])}"] if names else []
+        return [f"{len(names)} without a label in {self.path}: {first_names(names)}"] if names else []
 
 
 def read_labels(path: Path) -> LabelTable:

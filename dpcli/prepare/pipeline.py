@@ -12,6 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import as_utf8
 from dpcli.prepare.closing_line import closing_lines
@@ -91,8 +92,9 @@ class Report:
 
     def counts(self) -> str:
         """Returns what was written, in words."""
-        clouds = f" sequences, {self.frames} frames, {self.points} points" if self.points else " samples"
-        return f"{self.written}{clouds}, {len(self.skipped)} skipped"
+        said = counted(self.written, "sequence" if self.points else "sample")
+        inside = f", {counted(self.frames, 'frame')}, {counted(self.points, 'point')}" if self.points else ""
+        return f"{said}{inside}, {len(self.skipped)} skipped"
 
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.reader import require_folder
 from dpcli.runtime.progress import log
@@ -241,7 +242,7 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *,
     if errors:
         where = recipe.get("get", {}).get("ask", "")
         raise DataError(
-            f"{raw}: {len(errors)} things are missing or wrong{'; where to get it: ' + where if where else ''}"
+            f"{raw}: {counted(len(errors), 'thing')} missing or wrong{'; where to get it: ' + where if where else ''}"
         )
 
 

@@ -85,6 +85,7 @@ class Progress:
         self.counters: dict[str, float] = {}
         self.values: dict[str, object] = {}
         self.started = self._last = time.monotonic()
+        self._shown: tuple[int, dict[str, object]] | None = None  # what the last line told
         self._bar = self._handle = None
 
     def __enter__(self) -> Progress:
@@ -124,8 +125,8 @@ class Progress:
         elapsed = max(time.monotonic() - self.started, 1e-9)
         rate = (self.done - self.first) / elapsed
         parts = [f"{self.done}/{self.total} {100 * self.done // max(self.total, 1)}%" if self.total else f"{self.done}"]
-        parts.append(f"{rate:.2g} {self.unit}/s" if rate < 10 else f"{rate:.0f} {self.unit}/s")
-        parts += [f"{value / elapsed:.0f} {key}/s" for key, value in self.counters.items()]
+        rates = {self.unit: rate} | {key: value / elapsed for key, value in self.counters.items()}
+        parts += [f"{value:.2g} {key}/s" if value < 10 else f"{value:.0f} {key}/s" for key, value in rates.items()]
         parts += [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in self.values.items()]
         if self.total and rate > 0 and self.done < self.total:
             parts.append(f"eta {duration((self.total - self.done) / rate)}")
@@ -135,9 +136,10 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._handle, completed=self.done, text=self.status())
             return
-        now = time.monotonic()
-        if log.level >= 1 and (last or now - self._last >= _PLAIN_INTERVAL):
-            self._last = now
+        now, state = time.monotonic(), (self.done, dict(self.values))
+        due = state != self._shown if last else now - self._last >= _PLAIN_INTERVAL
+        if log.level >= 1 and due:
+            self._last, self._shown = now, state
             self.stream.write(f"dpc: {self.task} {self.status()}\n")
             self.stream.flush()
 

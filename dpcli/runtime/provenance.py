@@ -12,7 +12,8 @@ from dpcli import __version__
 from dpcli.runtime.whole_file import refuse_folder
 
 # Options that change how the work runs but not its result: left out, so that equal work gives equal bytes.
-_VALUED = {"-o", "--output", "--jobs", "--shard", "--dask", "--picture", "--animation", "--device", "--log", "--report"}
+_WRITTEN = {"-o", "--output", "--picture", "--animation", "--turntable", "--ply", "--page", "--run"}
+_VALUED = {*_WRITTEN, "--jobs", "--shard", "--dask", "--device"}
 _FLAGS = {"--quiet", "--verbose", "--debug", "--force", "--json"}
 _SHORT = re.compile(r"-[qv]+|-o.+")  # several letters, or the file, behind one dash
 

@@ -21,6 +21,17 @@ METERS = {  # in each unit of length that is known by the name that `length_unit
     **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3},
     **{"ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937},
 }
+
+
+def taken_for_meters(path: Path, length_unit: str) -> list[str]:
+    """Returns a warning for a file whose lengths are used as meters because its unit is none of METERS; else nothing."""
+    if length_unit in METERS:
+        return []
+    unit = repr(length_unit) if length_unit else "not given"
+    known = ", ".join(METERS)
+    return [f"{path}: its unit of length is {unit}, which counts as 1 m here; convert the data with --unit ({known})"]
+
+
 _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
 
 

@@ -77,7 +77,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             "points_per_frame": _spread(reader.frame_sizes),
             "parts_per_sequence": _spread(_part_counts(reader)),
             "frame_interval": _spread(_intervals(reader), float),
-            "fields": list(reader.fields),
+            "fields": [*reader.fields, *(f"activation/{stream}" for stream in reader.file.get("activation", ()))],
             "range": ranges,
             "shifts": {name: shift.tolist() for name, shift in zip(reader.names, reader.shifts) if shift.any()},
             **_who(reader.class_names, reader.labels, reader.splits),

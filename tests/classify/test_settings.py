@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 
@@ -60,6 +61,8 @@ def test_a_variant_brings_its_choices_below_what_is_typed():
     expected = {**VARIANT_CHANGES["release"], "group_size": 5}
     assert {key: getattr(config, key) for key in expected} == expected
     assert config.centroids == PRESETS["quick"]["network"].centroids
+    told = KinetConfig.__dataclass_fields__["variant"].metadata["setting"]["help"]
+    assert set(re.findall(r"\w+", told)) >= set(VARIANT_CHANGES["thesis"]) - {"variant"}
     back = settings("release", variant="thesis").network
     assert {key: getattr(back, key) for key in VARIANT_CHANGES["thesis"]} == VARIANT_CHANGES["thesis"]
     assert settings("quick", variant="thesis").network == PRESETS["quick"]["network"]  # quick is no release

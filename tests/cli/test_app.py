@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 from dpcli.cli import app as cli
 from dpcli.cli.out_of_memory import naming_large
 from dpcli.errors import UsageError
+from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.fuzz.forks import Limits, forked
 from tests.fuzz.fuzz_options import is_bug, odd
@@ -47,6 +49,22 @@ def test_there_are_commands_at_every_depth():
 @pytest.fixture(scope="module")
 def whole() -> typer.Typer:
     return cli.application()
+
+
+def test_files_that_a_command_writes_beside_its_result_are_not_in_its_provenance(whole):
+    """Whichever option names a picture, a page or a folder to write: the result's bytes don't depend on it."""
+    recorded, commands = {}, [typer.main.get_command(whole)]
+    while commands:
+        command = commands.pop()
+        commands += getattr(command, "commands", {}).values()
+        for option in command.params:
+            if re.match(
+                r"Write (a|an|every|one) .*(file|folder|\.html|\.png|\.gif)|Folder for ",
+                getattr(option, "help", 0) or "",
+            ):
+                recorded |= {name: command_line(["x", name, "there", "--seed", "0"]) for name in option.opts}
+    assert {"--picture", "--ply", "--turntable", "--page", "--run", "--animation"} <= set(recorded)
+    assert set(recorded.values()) == {"dpc x --seed 0"}
 
 
 @pytest.mark.parametrize("path", PATHS, ids=" ".join)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +56,19 @@ def test_text_for_people(clouds: Path) -> None:
     text = dpc("info", clouds).stdout.decode()
     for part in ("4 sequences, 12 frames, 3,600 points", "train (2), test (2)", "[bold]push", "1. dpc made [it]"):
         assert part in text
+
+
+@pytest.mark.parametrize("unit, end", [("mm", " mm"), ("300 raw depth units", " (300 raw depth units)"), ("", "")])
+def test_a_unit_of_several_words_stands_apart_from_the_number(
+    clouds: Path, tmp_path: Path, unit: str, end: str
+) -> None:
+    shutil.copy(clouds, tmp_path / "c.h5")
+    with h5py.File(tmp_path / "c.h5", "r+") as file:
+        file.attrs["length_unit"] = unit
+    (line,) = (
+        line for line in dpc("info", tmp_path / "c.h5").stdout.decode().splitlines() if line.startswith("range x")
+    )
+    assert re.fullmatch(r"range x +-[\d.]+ to [\d.]+" + re.escape(end), line)
 
 
 def test_picture(clouds: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import torch
 
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.commands import fit
+from dpcli.generate4d.config import FitConfig, Supervision
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import read_scene, scene_origin
@@ -103,6 +104,13 @@ def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
         assert scored.returncode == 0, scored.stderr
         values[prior] = json.loads(scored.stdout)["metrics"]["per_role"]["test"]["psnr"]
     assert values["views"] > values["none"] + 1.0, values
+
+
+@pytest.mark.parametrize("train, prior, told", [(2, "auto", True), (2, "views", False), (0, "auto", False)])
+def test_given_views_that_are_not_used_are_told(train, prior, told, tmp_path, capsys):
+    views = toy_views(tmp_path / "views.h5", train)
+    fit._load(views, FitConfig(size=16), Supervision(prior=prior))
+    assert ("2 of its views may be fitted to, too, but only --prior views" in capsys.readouterr().err) == told
 
 
 def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):

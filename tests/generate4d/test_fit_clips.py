@@ -36,7 +36,7 @@ def test_processes_and_shards_fit_the_same_scenes(clips, tmp_path, dpc, dpc_here
     assert together.returncode == 0 and together.stdout.decode() == f"{tmp_path / 'jobs'}: 2 scenes\n", together.stderr
     for k in range(2):
         words = ("generate4d", "fit", *reversed(good), "-o", f"{tmp_path / 'shards'}/", *OPTIONS, "--shard", f"{k}/2")
-        assert dpc_here(*words).stdout == f"{tmp_path / 'shards'}: 1 scenes\n".encode()
+        assert dpc_here(*words).stdout == f"{tmp_path / 'shards'}: 1 scene\n".encode()
     for name in ("a.h5", "b.h5"):
         alone = content(tmp_path / name)
         for folder in ("jobs", "shards"):
@@ -49,7 +49,7 @@ def test_processes_and_shards_fit_the_same_scenes(clips, tmp_path, dpc, dpc_here
 
 def test_a_bad_clip_is_named_and_the_others_are_fitted(clips, tmp_path, dpc_here):
     done = dpc_here("generate4d", "fit", clips / "c.h5", clips / "a.h5", "-o", tmp_path / "out", *OPTIONS)
-    assert done.returncode == 3 and done.stdout == f"{tmp_path / 'out'}: 1 scenes\n".encode()
+    assert done.returncode == 3 and done.stdout == f"{tmp_path / 'out'}: 1 scene\n".encode()
     assert b"1 clips have no scene: " in done.stderr and b"c.h5" in done.stderr
     assert (tmp_path / "out" / "a.h5").exists() and not (tmp_path / "out" / "c.h5").exists()
 

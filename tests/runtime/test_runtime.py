@@ -159,6 +159,15 @@ def test_a_batch_log_gets_plain_lines(monkeypatch):
     )
 
 
+def test_a_log_s_last_line_is_not_there_twice_and_slow_rates_are_no_zeros(monkeypatch):
+    monkeypatch.setattr(progress, "_PLAIN_INTERVAL", 0.0)
+    stream = io.StringIO()
+    with progress.Progress("predict", 1, "sequence", stream) as bar:
+        bar.started -= 10
+        bar.advance(1, frames=4)
+    assert stream.getvalue().splitlines() == ["dpc: predict 1/1 100% 0.1 sequence/s 0.4 frames/s"]
+
+
 def test_durations():
     assert [progress.duration(s) for s in (5.9, 75, 3725)] == ["5s", "1m15s", "1h02m"]
 

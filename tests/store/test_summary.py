@@ -52,6 +52,13 @@ def test_summary_of_clouds_by_hand(tmp_path: Path) -> None:
         assert found["range"][axis] == [points[:, column].min(), points[:, column].max()]
 
 
+def test_activations_are_among_the_fields(tmp_path: Path) -> None:
+    write_clouds(tmp_path / "c.h5")
+    with h5py.File(tmp_path / "c.h5", "r+") as file:
+        file["activation/dynamic"] = np.zeros(21, np.float32)
+    assert summary(tmp_path / "c.h5")["fields"][-1] == "activation/dynamic"
+
+
 def test_summary_of_scores(tmp_path: Path) -> None:
     path = tmp_path / "s.h5"
     with ScoresWriter(path, class_names=["x", "y"], streams=("static",), provenance={"command": "dpc made"}) as writer:

@@ -125,7 +125,7 @@ def _forest_scores(
 def _seen(reader: CloudsReader, known: np.ndarray, rounds: list[tuple[np.ndarray, np.ndarray]]) -> str:
     people = reader.subjects[known]
     if people.min() < 0:
-        return "whether they are of the same people is not in the file"
+        return "of people whom it may know: the file doesn't say who is seen"
     shared = [set(people[learned].tolist()) & set(people[judged].tolist()) for learned, judged in rounds]
     return (
         "of people whom it also learned from: people never seen come out lower" if any(shared) else "of unseen people"

@@ -37,6 +37,7 @@ from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
@@ -323,7 +324,7 @@ def _new_model(settings: TrainingSettings, videos: _Videos, folder: RunFolder) -
 
 def _announce(device: torch.device, processes: Processes, videos: _Videos, settings: TrainingSettings) -> None:
     schedule = settings.schedule
-    threads = f"{device} ({torch.get_num_threads()} threads)"
+    threads = f"{device} ({counted(torch.get_num_threads(), 'thread')})"
     where = threads if device.type == "cpu" else torch.cuda.get_device_name(device)
     if processes.count > 1:
         where = (

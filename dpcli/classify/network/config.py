@@ -34,7 +34,7 @@ class KinetConfig:
     variant: Literal["thesis", "release"] = setting(
         "thesis",
         "Whether the thesis's text or its published code decides where they disagree: changes group_size, xyz_group, time_input,"
-        " weighting, merge, guard, fusion and grouping together.",
+        " weighting, merge, guard, fusion, grouping and static_temporal_radius together.",
     )
     backbone: str = setting(
         "pointnet2",

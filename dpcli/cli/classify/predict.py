@@ -12,6 +12,7 @@ from dpcli.cli.classify.options import Data, Model, RejectBelow, Split
 from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Seed, TrustedBackbone
 from dpcli.cli.spread_options import SpreadOptions
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 
 
@@ -73,4 +74,4 @@ def predict(
     if result.complete:
         typer.echo(f"{output}: complete")
     elif output != "-":
-        typer.echo(f"{output}: scores of {result.videos} videos in {result.classes} classes")
+        typer.echo(f"{output}: scores of {counted(result.videos, 'video')} in {result.classes} classes")

@@ -10,7 +10,8 @@ import typer
 from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Picture, Seed
 from dpcli.cli.settings_options import options_of
-from dpcli.cli.spread_options import SpreadOptions
+from dpcli.cli.spread_options import SpreadClips
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, PRESETS
 from dpcli.runtime.settings.catalog import Given
@@ -37,7 +38,7 @@ def fit(
     picture: Picture = None,
     seed: Seed = 0,
     device: Device = "auto",
-    spread: SpreadOptions,
+    spread: SpreadClips,
     force: Force = False,
 ) -> None:
     """Fit a 4D scene to the pictures of each views file. Running again continues; SIGTERM saves first (exit 75)."""
@@ -50,7 +51,7 @@ def fit(
             raise UsageError("--run and --picture are for one clip; several have a folder NAME.fit each, with previews")
         _fit_many(views, Path(output), config, supervision, seed=seed, device=device, force=force, spread=spread.spread)
         return
-    if spread != SpreadOptions():
+    if spread != SpreadClips():
         raise UsageError("--jobs, --shard and --dask spread many clips; one is fitted as a whole")
     from dpcli.generate4d.commands.fit import fit_scene
 
@@ -61,7 +62,7 @@ def _fit_many(views: list[str], folder: Path, *settings: Any, **options: Any) ->
     from dpcli.generate4d.commands.fit_clips import fit_clips
 
     fitted = fit_clips(views, folder, *settings, **options)
-    typer.echo(f"{folder}: {len(fitted.scenes)} scenes")
+    typer.echo(f"{folder}: {counted(len(fitted.scenes), 'scene')}")
     if fitted.failed:
         named = "; ".join(f"{views}: {reason}" for views, reason in fitted.failed[:5])
         raise DataError(f"{len(fitted.failed)} clips have no scene: {named}")

@@ -9,6 +9,7 @@ import typer
 from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Output, Seed
 from dpcli.cli.spread_options import SpreadOptions
+from dpcli.counted import counted
 
 
 @with_option_groups
@@ -56,4 +57,4 @@ def estimate_flow(
         spread=spread.spread,
     )
     if output != "-":
-        typer.echo(f"{output}: flow of {done.sequences} sequences, {done.frames} frames")
+        typer.echo(f"{output}: flow of {counted(done.sequences, 'sequence')}, {counted(done.frames, 'frame')}")

@@ -12,6 +12,7 @@ from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Output, Picture, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.cli.spread_options import SpreadOptions
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 from dpcli.segment.prediction_settings import CATALOG, PredictSettings
@@ -72,7 +73,7 @@ def predict(
         spread=spread.spread,
     )
     if output != "-":
-        typer.echo(f"{output}: parts of {sequences} sequences")
+        typer.echo(f"{output}: parts of {counted(sequences, 'sequence')}")
         for line in told_of_scenes(output) if settings.classical.method == "scene" else ():
             typer.echo(line)
 

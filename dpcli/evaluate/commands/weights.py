@@ -80,6 +80,10 @@ def _result(found: dict[Weights, Checked], folder: Path, incomplete: str = "") -
     closing = "A license is the project's; --json says where none is stated for the weights themselves."
     entries = [_entry_json(entry, each, folder) for entry, each in found.items()]
     data = {"task": "weights", "folder": str(folder), "weights": entries}
+    if not found:  # nothing to check
+        return Result(
+            data, [], [f"No weights are installed in {folder}; `dpc evaluate weights list` shows what there is."]
+        )
     return Result(data, [table], [*notes, closing, f"Folder: {folder}"], incomplete)
 
 

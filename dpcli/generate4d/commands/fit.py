@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, FitConfig, Supervision
 from dpcli.generate4d.fit import COLUMNS, FitRun
@@ -34,6 +35,7 @@ from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write_scene
+from dpcli.store.views import ViewsReader
 from dpcli.store.writing.already_made import already_made
 
 
@@ -102,6 +104,11 @@ def _load(path: Path, config: FitConfig, supervision: Supervision) -> Targets:
             f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
             " `dpc prepare video --views`, or use --prior none"
         )
+    if supervision.prior == "auto":
+        with ViewsReader(path) as reader:
+            unused = reader.header.role.count("train")
+        if unused:
+            log.info(f"{path}: {unused} of its views may be fitted to, too, but only --prior views does so")
     return targets
 
 
@@ -109,7 +116,7 @@ def _optimize(optimizer: SceneOptimizer, folder: RunFolder, settings: str) -> tu
     """Runs the fit in its folder; returns the model, on the CPU, and the numbers that the scene file tells of the fit."""
     targets, config = optimizer.targets, optimizer.config
     log.info(
-        f"fitting {targets.name} on {optimizer.device}: {targets.num_views} view(s) x {targets.num_frames} frames of"
+        f"fitting {targets.name} on {optimizer.device}: {counted(targets.num_views, 'view')} x {counted(targets.num_frames, 'frame')} of"
         f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
     )
     keep_freed_memory()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.draw.animation import output_kind, write_pictures
 from dpcli.draw.palette import LIGHT
 from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
@@ -96,7 +97,7 @@ def _render_path(renderer: Renderer, look: Look, output: Path, settings: RenderS
                 progress.advance()
 
         write_pictures(output, draw(), settings.fps or default_rate(renderer.scene, path), force=force)
-    log.info(f"{output}: {len(shots)} picture(s) of {shots[0].size[0]} x {shots[0].size[1]}")
+    log.info(f"{output}: {counted(len(shots), 'picture')} of {shots[0].size[0]} x {shots[0].size[1]}")
 
 
 def _render_views(
@@ -115,7 +116,7 @@ def _render_views(
             seed=int(root["seed"]),
             force=force,
         )
-    log.info(f"{output}: {header.num_views} views x {header.num_frames} frames")
+    log.info(f"{output}: {counted(header.num_views, 'view')} x {counted(header.num_frames, 'frame')}")
 
 
 def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: RenderSettings) -> None:

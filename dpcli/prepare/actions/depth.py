@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import as_utf8
+from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
     doubts_of_units,
@@ -165,7 +165,10 @@ class DepthVideos:
         for path, series, given in self._chosen[0]:
             name = as_utf8(path.relative_to(given).as_posix() if path != given else path.name)
             if name in items:
-                raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
+                raise DataError(
+                    f"{path}: another input is called {name!r}, too ({items[name].path}); rename one, or give the folder"
+                    " that holds both"
+                )
             items[name] = Item(name, path, extra={"series": series, "recording": is_recording(path)})
         return list(items.values())
 
@@ -267,8 +270,7 @@ class DepthVideos:
         """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
         if left_out := self._chosen[1]:
-            more = f" ... ({len(left_out)} in all)" if left_out[5:] else ""
-            lines.append(f"left out, by their names beside depth: {', '.join(left_out[:5])}{more}")
+            lines.append(f"left out, by their names beside depth: {first_names(left_out)}")
         unknown = not (self.intrinsics or self.calibration or self.fov)
         if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
@@ -280,7 +282,7 @@ class DepthVideos:
         if not self._timed:
             silent = [item.name for item in items if not _tells_time(item)]
             lines.append(
-                f"no times are written: {', '.join(silent[:3])} {'say' if silent[1:] else 'says'} none (--fps)"
+                f"no times are written: {first_names(silent, 3)} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
         return lines + (self._table.unnamed(items) if self._table else [])

@@ -98,4 +98,5 @@ class SyntheticArticulated:
         """Returns lines for the log about what the index holds and lacks."""
         counts = Counter({item.extra["object"]: item.split for item in items}.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
-        return [f"{self.objects} objects of {len(self.class_names)} kinds ({shares}), {len(items)} sequences"]
+        kinds = min(self.objects, len(self.class_names))  # they take turns
+        return [f"{self.objects} objects of {kinds} kinds ({shares}), {len(items)} sequences"]

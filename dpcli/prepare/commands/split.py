@@ -43,7 +43,7 @@ class SplitChoice:
     def __post_init__(self) -> None:
         ways = [way for way in (self.subjects, self.listed, self.fractions) if way is not None]
         if len(ways) > 1:
-            raise UsageError("--list, --subjects and --fractions were given together; use one")
+            raise UsageError("--list, --train-subjects and --fractions were given together; use one")
         if self.fractions is not None:
             low, total = min(self.fractions), sum(self.fractions)
             if not (low >= 0 and abs(total - 1) <= 1e-6):  # NaN, too
@@ -60,12 +60,15 @@ class SplitChoice:
             return splits_by_subject(source, subjects, self.subjects)
         if self.fractions is not None:
             if self.by_subject and min(subjects) < 0:
-                raise DataError(f"{source.path}: subjects are not known of all samples; leave --by-subject out")
+                raise DataError(
+                    f"{source.path}: --by-subject: subjects are not known of all samples; `dpc prepare ... --labels FILE.csv`"
+                    " takes them from a column subject"
+                )
             groups = list(subjects) if self.by_subject else list(range(len(splits)))
             strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
             return draw_splits(groups, strata, self.fractions, self.seed)
         if not any(splits):
-            raise DataError(f"{source.path}: has no splits; choose --list, --subjects or --fractions")
+            raise DataError(f"{source.path}: has no splits; choose --list, --train-subjects or --fractions")
         return list(splits)
 
 

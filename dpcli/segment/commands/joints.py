@@ -17,6 +17,7 @@ from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_u
 from dpcli.segment.multibody.axis_choice import with_point_axes
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
+from dpcli.store.schema import taken_for_meters
 
 SUFFIXES = (".h5", ".urdf", ".json")
 
@@ -39,6 +40,9 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
             raise UsageError(
                 f"-o {output}: one object, but {path.name} has {len(chosen)} sequences; name one with --sequence, or a folder"
             )
+        if suffix not in (".h5", ".json") and str(output) != "-":  # a URDF has meters
+            for line in taken_for_meters(reader.path, reader.length_unit):
+                log.warn(line)
         counts: Counter[str] = Counter()
         trees = _trees(reader, chosen, counts, picture)
         if str(output) == "-":

@@ -30,6 +30,7 @@ from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segme
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
+from dpcli.store.schema import taken_for_meters
 from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
@@ -118,6 +119,10 @@ def predict_file(
         work = PartsOfSequence(once, flow, refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         if force or not already_made(target, entry, PartsReader, WORK):
+            for line in (
+                taken_for_meters(reader.path, reader.length_unit) if settings.classical.method == "scene" else ()
+            ):
+                log.warn(line)
             with PartsWriter(
                 target,
                 num_parts=segmenter.slots,

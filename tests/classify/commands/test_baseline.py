@@ -71,7 +71,8 @@ def test_kept_columns_count(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "people, seen", [(True, "of unseen people"), (False, "whether they are of the same people is not in the file")]
+    "people, seen",
+    [(True, "of unseen people"), (False, "of people whom it may know: the file doesn't say who is seen")],
 )
 def test_without_a_test_split_every_video_is_judged_in_turn(tmp_path, people, seen):
     result = command.baseline(write(tmp_path / "a.h5", splits=False, people=people))

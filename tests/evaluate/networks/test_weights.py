@@ -373,6 +373,11 @@ def test_commands(run, tmp_path):
     assert [(entry["name"], entry["sha256"]) for entry in found] == [("toy", ENTRY.sha256)]
 
 
+def test_a_check_of_nothing_says_so(run, tmp_path):
+    done = run("check", "--weights", str(tmp_path))
+    assert done.exit_code == 0 and done.stdout.startswith(f"No weights are installed in {tmp_path}; ")
+
+
 def test_commands_that_fail(run, tmp_path):
     (tmp_path / "toy.bin").write_bytes(CONTENT[:-1] + b"x")
     with pytest.raises(DataError, match="toy: SHA-256"):

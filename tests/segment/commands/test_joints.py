@@ -165,6 +165,21 @@ def test_points_that_lie_on_one_another_have_joints_without_certainty(tmp_path):
     assert len(json.loads((tmp_path / "j.json").read_text())[0]["joints"]) == 1
 
 
+@pytest.mark.parametrize(
+    "output, unit, warned",
+    [("o.urdf", "furlong", True), ("robots", "", True), ("o.json", "furlong", False), ("o.urdf", "mm", False)],
+)
+def test_a_unit_that_no_table_knows_is_told_once_where_meters_are_written(output, unit, warned, tmp_path, capsys):
+    points = np.random.default_rng(0).random((60, 3), np.float32)
+    cloud = CloudSequence.from_frames("one", [points] * 2, part=[np.repeat([0, 1], 30)] * 2)
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, class_names=[], length_unit=unit) as writer:
+        share, flow = np.eye(2, dtype=np.float32)[cloud.part], [np.zeros((60, 3), np.float32)]
+        writer.write(cloud, share, np.array([(0, 1)]), np.tile(np.eye(4, dtype=np.float32), (1, 2, 1, 1)), flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / output, sequence=None, picture=None, force=False)
+    said = [line for line in capsys.readouterr().err.splitlines() if "unit of length" in line]
+    assert len(said) == warned and all(repr(unit) in line or "not given" in line for line in said)
+
+
 def test_one_frame_has_no_joints(tmp_path):
     cloud = CloudSequence.from_frames("still", [np.eye(3, dtype=np.float32)], part=[np.arange(3)])
     with PartsWriter(tmp_path / "p.h5", num_parts=3, class_names=[], length_unit="m") as writer:

@@ -56,6 +56,19 @@ def test_no_name_in_a_file_leads_out_of_the_folder_of_ply_files(dpc_here, tmp_pa
     assert found == ["ply/a_b_1/0000.ply", "ply/a_b_2/0000.ply", "ply/object/0000.ply"]
 
 
+@pytest.mark.parametrize(
+    "method, unit, warned", [("scene", "furlong", 1), ("scene", "cm", 0), ("multibody", "furlong", 0)]
+)
+def test_a_unit_that_no_table_knows_is_told_once_where_lengths_are_meters(method, unit, warned, dpc_here, tmp_path):
+    rng = np.random.default_rng(0)
+    with CloudsWriter(tmp_path / "c.h5", class_names=[], length_unit=unit) as writer:
+        for name in "ab":
+            writer.write(CloudSequence.from_frames(name, [rng.random((200, 3), np.float32)] * 2))
+    done = dpc_here("segment", "predict", tmp_path / "c.h5", "-o", tmp_path / "p.h5", "--method", method)
+    assert done.returncode == 0, done.stderr.decode()
+    assert done.stderr.decode().count("unit of length is 'furlong', which counts as 1 m here") == warned
+
+
 def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, monkeypatch):
     from dpcli.segment.commands import predict as commands
 

@@ -11,6 +11,7 @@ import typer
 from dpcli.cli.options import Force, Seed
 from dpcli.cli.prepare.lists import three_shares, whole_numbers
 from dpcli.cli.prepare.options import Compression
+from dpcli.counted import counted
 from dpcli.standard_streams import printable
 
 if TYPE_CHECKING:
@@ -82,4 +83,4 @@ def split(
     with input_file(clouds) as source, output_file(output) as target:
         counts = split_file(source, target, options.choice(), compression=compression, force=force)
     for name, count in counts.items() if output != "-" else ():
-        typer.echo(printable(f"{name or 'in no split, left out'}: {count} sequences"))
+        typer.echo(printable(f"{name or 'in no split, left out'}: {counted(count, 'sequence')}"))

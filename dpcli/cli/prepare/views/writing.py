@@ -7,6 +7,7 @@ from typing import Any
 import typer
 
 from dpcli.cli.prepare.conversion import require_output
+from dpcli.counted import counted
 from dpcli.standard_streams import printable
 
 
@@ -20,4 +21,8 @@ def write_views(make_clip: Any, output: str, *, source: str, **options: Any) -> 
         header = convert_clip(make_clip, path, source=source, task=f"prepare {source}", **options)
     if output != "-":
         size = f"{header.size[0]}x{header.size[1]}"
-        typer.echo(printable(f"{output}: {header.name}, {header.num_views} views, {header.num_frames} frames, {size}"))
+        typer.echo(
+            printable(
+                f"{output}: {header.name}, {counted(header.num_views, 'view')}, {counted(header.num_frames, 'frame')}, {size}"
+            )
+        )
