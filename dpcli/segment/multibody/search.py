@@ -20,7 +20,9 @@ _SHOWN = 0.6  # share of the matches in other frames of a body's points that are
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
-def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings, origin: np.ndarray) -> Explanation:
+def explain_sequence(
+    clouds: list[np.ndarray], settings: MultibodySettings, origin: np.ndarray | tuple[float, float, float] = (0, 0, 0)
+) -> Explanation:
     """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
 
     origin (3): of the coordinates in which the frames were recorded. If one camera saw them, from there or elsewhere, points
@@ -28,7 +30,7 @@ def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings, orig
     """
     search = Search(Frames(clouds), settings)
     found = search.run()
-    camera = find_camera(search.frames, found, origin)
+    camera = find_camera(search.frames, found, np.asarray(origin, np.float64))
     if camera is not None:
         search = Search(search.frames.seen_by(camera), settings, search.hypotheses)
         found = search.run()

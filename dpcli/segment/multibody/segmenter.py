@@ -57,7 +57,7 @@ class MultibodySegmenter(Segmenter):
             return [torch.eye(self.slots)[:1].repeat(len(frames[0]), 1)], {}
         if tracks is not None:
             return self._by_tracks(follow_tracks([frame.numpy() for frame in frames], tracks), pairs)
-        found = explain_sequence([frame.numpy() for frame in frames], self.settings, np.array(origin, np.float64))
+        found = explain_sequence([frame.numpy() for frame in frames], self.settings, origin)
         sizes = [len(frame) for frame in frames]
         masks = list(torch.from_numpy(masks_of(found, sizes, self.slots)).split(sizes))
         return masks, {pair: self._motions(found, *pair) for pair in pairs}

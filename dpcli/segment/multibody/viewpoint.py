@@ -1,4 +1,4 @@
-"""Where the one camera stood that saw all frames of a sequence, if one did."""
+"""Finds where the one camera stood that saw all frames of a sequence, if one did."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a camera could see of a frame, and which moved points would be hidden from it.
+"""Depth maps: what a camera could see of a frame, and which moved points would be hidden from it.
 
 A surface that turns out of view leaves its points without a match in other frames. Where a motion takes a point behind what
 the camera saw there, the missing match says nothing against that motion.
