@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 
+from dpcli.counted import counted
 from dpcli.evaluate.report.blocks import MISSING, Cell, Figure, Report, Section, Table
 from dpcli.evaluate.report.error_clouds import palette_words
 from dpcli.standard_streams import printable
@@ -17,7 +18,7 @@ def report_html(report: Report) -> str:
     """Returns the page. Texts from files are escaped; equal reports give equal pages."""
     source = files(__package__)
     script = source.joinpath("report.js").read_text("utf-8").replace("<!--PALETTE-->", palette_words())
-    count = f"{len(report.sections)} result{'s' if len(report.sections) != 1 else ''}"
+    count = counted(len(report.sections), "result")
     pieces = {
         "TITLE": escape(report.title),
         "COUNT": count,

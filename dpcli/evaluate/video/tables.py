@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.evaluate.choices import PICTURE_METRICS
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.proportions import divide, mean_defined
@@ -180,7 +181,7 @@ def _surface_note(score: SurfaceScore) -> str:
 
 def _picture_notes(report: VideoReport) -> list[str]:
     choices, (width, height) = describe_protocol(report.protocol), report.size
-    counts = f"{len(report.views)} view{'s' if len(report.views) > 1 else ''}, {_frames(report.views)} frames"
+    counts = f"{counted(len(report.views), 'view')}, {_frames(report.views)} frames"
     lines = [
         f"{counts} of {width}x{height} pixels over {choices['background']}, {choices['colors']}, size: {choices['size']}; "
         f"data range {choices['data_range']}; means {choices['mean']}.",

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
@@ -268,7 +269,7 @@ class DepthVideos:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
+        lines = [f"{counted(len(items), 'depth video')} found"]
         if left_out := self._chosen[1]:
             lines.append(f"left out, by their names beside depth: {first_names(left_out)}")
         unknown = not (self.intrinsics or self.calibration or self.fov)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
@@ -256,9 +257,7 @@ class ArraySequences(OwnScans):
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         files = len(self._paths)
-        lines = [
-            f"{len(items)} sequence{'s' if len(items) != 1 else ''} in {files} file{'s' if files != 1 else ''} of arrays"
-        ]
+        lines = [f"{counted(len(items), 'sequence')} in {counted(files, 'file')} of arrays"]
         good = next((item for item in items if not item.problem), None)
         if good:
             lines[0] += self._how(good)

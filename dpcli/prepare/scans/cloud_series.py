@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
@@ -119,7 +120,7 @@ def _advice(suffixes: Iterable[str]) -> str:
 
 
 def _counted(foreign: Counter[str]) -> tuple[str, ...]:
-    return tuple(f"{count} {suffix} file{'s' if count > 1 else ''}" for suffix, count in sorted(foreign.items()))
+    return tuple(counted(count, f"{suffix} file") for suffix, count in sorted(foreign.items()))
 
 
 def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterator[tuple[Path, list[str], Counter[str]]]:

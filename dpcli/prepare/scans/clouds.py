@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
@@ -134,7 +135,7 @@ class CloudFolders(OwnScans):
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         frames = sum(len(item.extra["series"].names) for item in items)
-        lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
+        lines = [f"{counted(len(items), 'sequence')} of {frames} frames found"]
         if self._first[1]:
             lines[0] += f"; not read: {first_names(self._first[1], _LISTED)}"
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"

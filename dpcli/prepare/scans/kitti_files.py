@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
@@ -110,7 +111,7 @@ def read_png(
     if image is None:
         raise DataError(f"{path}: not a readable PNG (empty or truncated); copy it again")
     if image.dtype.itemsize * 8 not in bits or (image.shape[2] if image.ndim == 3 else 1) != channels:
-        expected = f"{' or '.join(map(str, bits))} bits, {channels} channel{'s' if channels > 1 else ''}"
+        expected = f"{' or '.join(map(str, bits))} bits, {counted(channels, 'channel')}"
         raise DataError(f"{path}: is {image.dtype} {image.shape}; expected {expected}")
     if size is not None and image.shape[:2] != size:
         found = f"{image.shape[1]}x{image.shape[0]}"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.cloud import without
@@ -102,5 +103,5 @@ class RecordedClouds(OwnScans):
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds."""
         unread = f"; not read: {first_names(self._first[1], _LISTED)} (--keep-fields)" if self._first[1] else ""
-        lines = [f"{len(items)} recording{'s' if len(items) != 1 else ''} found{unread}"]
+        lines = [f"{counted(len(items), 'recording')} found{unread}"]
         return lines + (self._table.unnamed(items) if self._table else [])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
@@ -142,7 +143,7 @@ class TableSequences(OwnScans):
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         tables = len(self._paths)
-        lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} in {tables} table{'s' if tables != 1 else ''}"]
+        lines = [f"{counted(len(items), 'sequence')} in {counted(tables, 'table')}"]
         good = next((item for item in items if not item.problem), None)
         if good:
             loaded = self._load(good.path)

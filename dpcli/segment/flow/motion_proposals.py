@@ -35,9 +35,9 @@ def shift_by(offsets: np.ndarray) -> np.ndarray:
 
 
 def compose_motions(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Returns motions (H,3,4) that follow one other motion (3,4)."""
-    rotation = after[:, :, :3] @ before[:, :3]
-    return np.concatenate([rotation, after[:, :, :3] @ before[:, 3:] + after[:, :, 3:]], 2)
+    """Returns motions (...,3,4) that follow one other motion (3,4)."""
+    rotation = after[..., :3] @ before[:, :3]
+    return np.concatenate([rotation, after[..., :3] @ before[:, 3:] + after[..., 3:]], -1)
 
 
 def propose_motions(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:

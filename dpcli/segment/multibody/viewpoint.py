@@ -12,7 +12,7 @@ from dpcli.segment.multibody.visibility import DepthMap
 _DIRECTIONS = 100  # tried, some 20 degrees apart
 _DISTANCES = (2.0, 1.5, 3.0, 6.0)  # diameters from the middle of all points
 _FINER = (0.18, 0.09, 0.05)  # radians around the best direction
-_OUTSIDE = 0.6  # diameters from the middle, beyond which the file's origin may be the camera
+_RECORDED = (0.6, 100.0)  # diameters from the middle, between which the file's origin may be the camera
 _FRAMES = 4  # whose depth maps are drawn
 _POINTS = 1000  # badly explained points that are looked up in each of them
 _BAD = 0.5  # cost from which on a point is badly explained
@@ -30,7 +30,7 @@ def find_camera(frames: Frames, found: Explanation, origin: np.ndarray) -> np.nd
     """
     sight = _Sight(frames, found)
     recorded = origin - sight.middle
-    if np.linalg.norm(recorded) > _OUTSIDE and sight.accepts(recorded):
+    if _RECORDED[0] < np.linalg.norm(recorded) < _RECORDED[1] and sight.accepts(recorded):
         return sight.camera(recorded)
     best = max(_DISTANCES[0] * _sphere(_DIRECTIONS), key=sight.score)
     if sight.shares(best)[1] < _LEAST_HIDDEN / 2:
@@ -59,7 +59,7 @@ class _Sight:
         return np.concatenate([axes, -axes @ (self.middle + place)[:, None]], 1)
 
     def accepts(self, place: np.ndarray) -> bool:
-        """Returns whether a camera there sees few points behind others, and not much of what is badly explained."""
+        """Returns whether a camera there sees few points behind others, and hides enough of what is badly explained."""
         behind, hidden, _ = self.shares(place)
         return behind <= _MOST_BEHIND and hidden >= _LEAST_HIDDEN
 

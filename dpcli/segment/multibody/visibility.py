@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.ops.cpu.jit import inlined, kernel
+from dpcli.segment.flow.motion_proposals import compose_motions
 
 _HIDDEN_COST = 0.5  # of a hidden point at most: between what is explained (some 0.2) and what isn't (1)
 _BEHIND = 1.5  # spacings that a hidden point lies behind all that is seen there
@@ -25,8 +26,7 @@ class DepthMap:
 
     camera (3,4): takes coordinates to right, down and ahead of the camera. per_cell: cells of a unit at depth 1. first (2):
     row and column of cell [0, 0]. far f32 (H,W): the largest depth in a cell and the eight around it, -inf without a point.
-    near f32 (H,W): the smallest depth in a cell, inf without a point.
-    margin: how much deeper than `far` a hidden point lies.
+    near f32 (H,W): the smallest depth in a cell, inf without a point. margin: how much deeper than `far` a hidden point lies.
     """
 
     camera: np.ndarray
@@ -65,8 +65,7 @@ class DepthMap:
         Of these the cost f32 (n) is no more than `_HIDDEN_COST`, and if it was, the point itself, `start` plus its index, is
         in `nearest` i32 (n), so that its label needs no support from this frame.
         """
-        turn, shift = self.camera[:, :3] @ motion[:, :3], self.camera[:, :3] @ motion[:, 3] + self.camera[:, 3]
-        camera = np.concatenate([turn, shift[:, None]], 1)
+        camera = compose_motions(self.camera, motion)
         hide_kernel(
             points, camera, self.per_cell, self.first, self.far, self.margin, _HIDDEN_COST, start, cost, nearest
         )

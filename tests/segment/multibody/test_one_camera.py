@@ -47,7 +47,7 @@ def test_a_camera_is_found_within_20_degrees_if_the_clouds_show_one_side():
     assert np.linalg.det(camera[:, :3]) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("origin", [np.zeros(3), EYE], ids=["amid", "outside"])
+@pytest.mark.parametrize("origin", [np.zeros(3), EYE, np.full(3, 1e9)], ids=["amid", "outside", "far"])
 def test_clouds_of_all_sides_have_no_camera(origin):
     frames = Frames(turning_box(5, all_sides=True))
     assert find_camera(frames, Search(frames, MultibodySettings()).run(), origin) is None
