@@ -29,12 +29,12 @@ def explain_sequence(
     that it can't see need no match.
     """
     search = Search(Frames(clouds), settings)
-    found = search.run()
+    found = search.begin()
     camera = find_camera(search.frames, found, np.asarray(origin, np.float64))
     if camera is not None:
         search = Search(search.frames.seen_by(camera), settings, search.hypotheses)
-        found = search.run()
-    found = turn_least(search.frames, found)
+        found = search.begin()
+    found = turn_least(search.frames, search.improve(found))
     return search.judged_anew(simplify_motions(search.frames, found))
 
 
@@ -46,10 +46,12 @@ class Search:
         self.hypotheses = find_hypotheses(frames) if hypotheses is None else hypotheses
         self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
 
-    def run(self) -> Explanation:
-        """Returns the explanation: grown, pruned, grown anew without each body, split, and its motions tightened."""
-        found = self._grow(self._first())
-        found = self._prune(found)
+    def begin(self) -> Explanation:
+        """Returns a first explanation: grown, and pruned."""
+        return self._prune(self._grow(self._first()))
+
+    def improve(self, found: Explanation) -> Explanation:
+        """Returns the explanation after growth without each body in turn and splits, its motions tightened."""
         for _ in range(self.settings.regrow):
             better = self._regrow(found)
             if better is found:
