@@ -125,8 +125,9 @@ def _find_masks_and_motions(
     They come from one explanation of all frames, or, pair by pair, from flows and the masks of single frames.
     """
     if isinstance(segmenter, MultibodySegmenter):
+        threads, origin = torch.get_num_threads(), tuple(-frames.scale * frames.center)
         with torch_threads(1):
-            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks, tuple(-frames.scale * frames.center))
+            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks, origin, threads)
         return masks, [motions[pair] for pair in pairs]
     flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
     masks = _refine_masks(frames.thin, flows, masks, options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,21 +30,20 @@ class Hypothesis:
     trajectory: Trajectory
 
 
-def find_hypotheses(frames: Frames) -> list[Hypothesis]:
-    """Returns different bodies that pairs of frames show, the largest first."""
+def find_hypotheses(frames: Frames, map_: Callable = map) -> list[Hypothesis]:
+    """Returns different bodies that pairs of frames show, the largest first; `map_` searches pairs and carries bodies on."""
     pairs, surfaces = _pairs(len(frames)), frames.surfaces
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda pair: find_surface_bodies(surfaces[pair[0]], surfaces[pair[1]], _SEARCH), pairs))
-        motions = {pair: bodies.motion for pair, bodies in zip(pairs, found)}
-        seeds = [
-            (pair, k, np.flatnonzero(bodies.label == k))
-            for pair, bodies in zip(pairs, found)
-            for k in range(len(bodies.motion))
-        ]
-        seeds = sorted((seed for seed in seeds if len(seed[2]) >= _FEWEST), key=lambda seed: -len(seed[2]))
-        seeds = _spread(seeds, len(frames))
-        carried = pool.map(lambda seed: carry(frames, seed[0][0], surfaces[seed[0][0]].points[seed[2]], motions), seeds)
-        return keep_different(frames, list(carried))
+    found = list(map_(lambda pair: find_surface_bodies(surfaces[pair[0]], surfaces[pair[1]], _SEARCH), pairs))
+    motions = {pair: bodies.motion for pair, bodies in zip(pairs, found)}
+    seeds = [
+        (pair, k, np.flatnonzero(bodies.label == k))
+        for pair, bodies in zip(pairs, found)
+        for k in range(len(bodies.motion))
+    ]
+    seeds = sorted((seed for seed in seeds if len(seed[2]) >= _FEWEST), key=lambda seed: -len(seed[2]))
+    seeds = _spread(seeds, len(frames))
+    carried = map_(lambda seed: carry(frames, seed[0][0], surfaces[seed[0][0]].points[seed[2]], motions), seeds)
+    return keep_different(frames, list(carried))
 
 
 def _pairs(frames: int) -> list[tuple[int, int]]:

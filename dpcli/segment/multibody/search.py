@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of, label_points, refit, without_empty
@@ -21,30 +25,37 @@ _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residu
 
 
 def explain_sequence(
-    clouds: list[np.ndarray], settings: MultibodySettings, origin: np.ndarray | tuple[float, float, float] = (0, 0, 0)
+    clouds: list[np.ndarray],
+    settings: MultibodySettings,
+    origin: np.ndarray | tuple[float, float, float] = (0, 0, 0),
+    threads: int = 1,
 ) -> Explanation:
     """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
 
     origin (3): of the coordinates in which the frames were recorded. If one camera saw them, from there or elsewhere, points
-    that it can't see need no match.
+    that it can't see need no match. threads: in which what is tried is judged side by side; they change no result.
     """
-    search = Search(Frames(clouds), settings)
-    found = search.begin()
-    camera = find_camera(search.frames, found, np.asarray(origin, np.float64))
-    if camera is not None:
-        search = Search(search.frames.seen_by(camera), settings, search.hypotheses)
+    frames = Frames(clouds)
+    with ThreadPoolExecutor(threads) as pool:
+        hypotheses = find_hypotheses(frames, pool.map)
+        search = Search(frames, settings, hypotheses, pool.map)
         found = search.begin()
-    found = turn_least(search.frames, search.improve(found))
-    return search.judged_anew(simplify_motions(search.frames, found))
+        camera = find_camera(frames, found, np.asarray(origin, np.float64))
+        if camera is not None:
+            search = Search(frames.seen_by(camera), settings, hypotheses, pool.map)
+            found = search.begin()
+        found = turn_least(search.frames, search.improve(found))
+        return search.judged_anew(simplify_motions(search.frames, found))
 
 
 class Search:
-    """Searches the explanation of one sequence."""
+    """Searches the explanation of one sequence; `map_` judges what is tried, one after the other or side by side."""
 
-    def __init__(self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis] | None = None) -> None:
-        self.frames, self.settings = frames, settings
-        self.hypotheses = find_hypotheses(frames) if hypotheses is None else hypotheses
-        self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
+    def __init__(
+        self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis], map_: Callable = map
+    ) -> None:
+        self.frames, self.settings, self.map = frames, settings, map_
+        self.pool = list(map_(lambda one: body_of(frames, one.trajectory), hypotheses))
 
     def begin(self) -> Explanation:
         """Returns a first explanation: grown, and pruned."""
@@ -63,7 +74,7 @@ class Search:
         """Returns the explanation after growth with motions of its bodies' patches, as long as the energy falls."""
         first = self.pool
         for _ in range(self.settings.regrow):
-            self.pool = split_bodies(self.frames, found)
+            self.pool = split_bodies(self.frames, found, self.map)
             better = self._prune(self._grow(found))
             if better.energy > found.energy - _SPLIT_GAIN:
                 break
@@ -94,7 +105,7 @@ class Search:
     def _grow(self, found: Explanation) -> Explanation:
         """Returns the explanation with further bodies, as long as the energy falls."""
         while len(found.bodies) < self.settings.most_bodies:
-            tried = [self._with(found, self.pool[h]) for h in self._most_promising(found)]
+            tried = list(self.map(partial(self._with, found), self._most_promising(found)))
             if not tried:
                 break
             best = min(tried, key=lambda one: one.energy)
@@ -107,18 +118,18 @@ class Search:
         """Returns the explanation with a further body, fitted: a motion that is a spacing off explains a small part badly."""
         return self._fitted(label_points(self.frames, [*found.bodies, body], self.settings))
 
-    def _most_promising(self, found: Explanation) -> list[int]:
-        """Returns the hypotheses by which connected points would save most, the best first."""
+    def _most_promising(self, found: Explanation) -> list[Body]:
+        """Returns the bodies by which connected points would save most, the best first."""
         current = found.cost[np.arange(len(found.label)), found.label]
         main, price = found.bodies[0].motions, self.settings.displacement
         saved = [self.frames.gain(current, body.cost, body.motions, main, price) for body in self.pool]
         order = np.argsort(np.negative(saved), kind="stable")[:_TRIED]
-        return [int(h) for h in order if saved[h] > 0]
+        return [self.pool[h] for h in order if saved[h] > 0]
 
     def _prune(self, found: Explanation) -> Explanation:
         """Returns the explanation without bodies that cost more than they save, the most needless one first."""
         while len(found.bodies) > 1:
-            fewer = [self._without(found, k) for k in range(len(found.bodies))]
+            fewer = self.map(partial(self._without, found), range(len(found.bodies)))
             best = min(fewer, key=lambda one: one.energy)
             if best.energy > found.energy:
                 break

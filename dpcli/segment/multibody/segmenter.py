@@ -47,17 +47,19 @@ class MultibodySegmenter(Segmenter):
         pairs: list[tuple[int, int]],
         tracks: list[np.ndarray] | None = None,
         origin: tuple[float, float, float] = (0, 0, 0),
+        threads: int = 1,
     ) -> tuple[list[Tensor], Motions]:
         """Returns a mask (N_t,S) f32 for each frame (N_t,3), and the motions of all parts for the pairs of frames.
 
         Frames have 9 points or more and the sequence a diameter of about 1. Slots without a body stand still. tracks:
         the identity i64 (N_t) of each point, where it is known. origin: of the coordinates in which the frames were recorded.
+        threads: of the search.
         """
         if len(frames) == 1:
             return [torch.eye(self.slots)[:1].repeat(len(frames[0]), 1)], {}
         if tracks is not None:
             return self._by_tracks(follow_tracks([frame.numpy() for frame in frames], tracks), pairs)
-        found = explain_sequence([frame.numpy() for frame in frames], self.settings, origin)
+        found = explain_sequence([frame.numpy() for frame in frames], self.settings, origin, threads)
         sizes = [len(frame) for frame in frames]
         masks = list(torch.from_numpy(masks_of(found, sizes, self.slots)).split(sizes))
         return masks, {pair: self._motions(found, *pair) for pair in pairs}

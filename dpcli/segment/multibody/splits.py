@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from dpcli.segment.flow.motion_proposals import cluster_patches
@@ -14,13 +16,10 @@ _TOUCHING = 2  # bodies around whose motions a patch is tried with, besides its 
 _FITS = (2.0, 1.0)  # last residual of the fits one after the other, in spacings
 
 
-def split_bodies(frames: Frames, found: Explanation) -> list[Body]:
-    """Returns a body for each patch of each body, its motions fitted to the patch's points of all frames."""
-    return [
-        _fit_patch(frames, inside, starts)
-        for k in range(len(found.bodies))
-        for inside, starts in _patches_of(frames, found, k)
-    ]
+def split_bodies(frames: Frames, found: Explanation, map_: Callable = map) -> list[Body]:
+    """Returns a body for each patch of each body, its motions fitted by `map_` to the patch's points of all frames."""
+    patches = [patch for k in range(len(found.bodies)) for patch in _patches_of(frames, found, k)]
+    return list(map_(lambda patch: _fit_patch(frames, *patch), patches))
 
 
 def _patches_of(frames: Frames, found: Explanation, k: int) -> list[tuple[np.ndarray, list[Trajectory]]]:

@@ -97,7 +97,8 @@ def test_a_tilted_motion_that_fits_beats_one_that_slides_in_its_own_plane():
         slid[t, :, 3] += lid[t, :, 0] * 0.075  # no ICP brings a plate back that slid: it lies in its plane
         tilted[t] = lid[t] @ turn(0.05, (0.0, 1.0, 0.0), (0.0, 0.0, 0.3))
     pool = [Hypothesis(0, clouds[0], trajectory) for trajectory in (body, slid, tilted)]
-    found = Search(Frames(clouds), MultibodySettings(regrow=0), pool).run()
+    search = Search(Frames(clouds), MultibodySettings(regrow=0), pool)
+    found = search.improve(search.begin())
     both = [[relative_motion(one, t, t + 1) for one in (found.bodies[-1].trajectory, lid)] for t in range(3)]
     gaps = [np.linalg.norm(move(one - two, clouds[t][part[t] == 1]), axis=1) for t, (one, two) in enumerate(both)]
     assert len(found.bodies) == 2
@@ -232,11 +233,11 @@ def test_points_in_one_place_and_far_apart_frames():
     assert np.isfinite(predicted(apart)[1].motion).all()
 
 
-def test_most_bodies_is_kept_and_the_same_input_gives_the_same_answer():
+def test_most_bodies_is_kept_and_one_thread_and_two_give_the_same_answer():
     clouds = [np.float32(chest().frame(t)) for t in range(3)]
     one = explain_sequence(clouds, MultibodySettings(most_bodies=1))
     assert len(one.bodies) == 1
-    first, second = (explain_sequence(clouds, MultibodySettings()) for _ in range(2))
+    first, second = (explain_sequence(clouds, MultibodySettings(), threads=threads) for threads in (1, 2))
     assert first.energy == second.energy and (first.label == second.label).all() and first.energy < one.energy
 
 

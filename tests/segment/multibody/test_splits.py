@@ -55,6 +55,6 @@ def test_a_patch_of_a_body_gets_the_motion_of_its_part():
 def test_the_search_finds_a_part_whose_motion_nobody_proposed():
     clouds, part, (still, _) = two_links()
     search = Search(Frames(clouds), MultibodySettings(), [Hypothesis(0, clouds[0], still)])
-    found = search.run()
+    found = search.improve(search.begin())
     assert len(found.bodies) == 2
     assert rand_index(torch.from_numpy(found.label), torch.from_numpy(part)) > 0.9
