@@ -41,8 +41,19 @@ _ARRAYS_BESIDE = re.compile(
 
 
 @dataclass(frozen=True)
+class TimesBeside:
+    """Holds the file that lists the times of a series, and these: seconds since the first frame, f64 (F), rising."""
+
+    path: Path
+    seconds: np.ndarray
+
+
+@dataclass(frozen=True)
 class Series:
-    """Holds the files of one series in their order; ``left_out`` names what else lay there, a phrase each."""
+    """Holds the files of one series in their order; ``left_out`` names what else lay there, a phrase each.
+
+    ``beside``: times that a file beside the frames lists.
+    """
 
     folder: Path
     names: tuple[str, ...]
@@ -50,6 +61,7 @@ class Series:
     left_out: tuple[str, ...] = ()
     numbered: bool = True
     suffix: str = field(default="", compare=False)
+    beside: TimesBeside | None = field(default=None, compare=False)
 
     @property
     def paths(self) -> list[Path]:
@@ -69,17 +81,22 @@ class Series:
         """Returns the running numbers in the names, i64 (F), rising; None when the names hold none, or more than one."""
         return NumberColumns(parse_names(self.names)).running_numbers() if self.numbered else None
 
-    def times(self) -> np.ndarray | None:
+    def name_times(self) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (F), rising, where the names are times; None when they are not."""
         return NumberColumns(parse_names(self.names)).times() if self.numbered else None
 
+    def times(self) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (F), rising, as the names or a file beside them tell; else None."""
+        named = self.name_times()
+        return self.beside.seconds if named is None and self.beside else named
+
     def frame_times(self, fps: float | None) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (F): numbers in the names divided by ``fps``, so that what is missing
-        leaves a gap, or else what the names tell; None when neither says anything.
+        leaves a gap, or else the times that are told; None when neither says anything.
         """
         if fps is None:
             return self.times()
-        numbers = None if self.times() is not None else self.numbers()
+        numbers = None if self.name_times() is not None else self.numbers()
         places = np.arange(len(self.names)) if numbers is None else _evenly(numbers)
         return places / fps
 
@@ -114,7 +131,9 @@ def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
             lines.append(
                 f"{name}: its frames are {series.described()}; left out: {first_names(series.left_out, _LISTED)}"
             )
-        gaps = missing_numbers(series.numbers()) if series.times() is None else []
+        gaps = missing_numbers(series.numbers()) if series.name_times() is None else []
+        if series.beside:
+            lines.append(f"{name}: its frames have the times in {series.beside.path.name}")
         if order := _doubts_of_order(series):
             lines.append(f"{name}: {order}")
         if gaps:
@@ -134,7 +153,7 @@ def _doubts_of_order(series: Series) -> str:
         return f"no number counts its frames; they are in the order of their names: {', '.join(series.names[:3])} ..."
     names = parse_names(series.names)
     found = _by_outer_numbers(names) if len({name.shape for name in names}) == 1 else None
-    clocks = found is not None and (_are_clocks(names) or series.times() is not None)
+    clocks = found is not None and (_are_clocks(names) or series.name_times() is not None)
     if found is None or clocks or not 1 < len(found[0]) < len(names) / 2:
         return ""
     return (

@@ -42,6 +42,7 @@ from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
+from dpcli.prepare.times_beside import with_times
 from dpcli.store import CloudSequence
 
 if TYPE_CHECKING:
@@ -327,7 +328,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     if not path.is_dir() or is_recording(path):
         return [(path, None)]
     if own := frame_series(path, pattern):
-        return [(path, own)]
+        return [(path, with_times(own, path))]
     found: list[tuple[Path, Series | None]] = []
     suffixes = (*VIDEO_SUFFIXES, *ARRAY_SUFFIXES)
     found += [(recording, None) for recording in find_recordings(path)]
@@ -338,7 +339,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
         for name in folders:
             with suppress(PermissionError):  # it is told as skipped
                 if series := frame_series(Path(folder, name), pattern):
-                    found.append((Path(folder, name), series))
+                    found.append((Path(folder, name), with_times(series, path)))
                     clips.add(os.path.join(folder, name))
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins

@@ -17,6 +17,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
+from dpcli.prepare.times_beside import with_times
 
 _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  # of two files of one frame
 
@@ -69,9 +70,10 @@ def find_sequences(
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
-    return _without_logs(
-        root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses, alone
-    )
+    ordered = sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix()))
+    first, *rest = [with_times(one, root) for one in _without_logs(root, ordered, poses, alone)]
+    used = {one.beside.path.relative_to(root).as_posix() for one in (first, *rest) if one.beside}
+    return [replace(first, left_out=tuple(name for name in first.left_out if name not in used)), *rest]
 
 
 def _of_pictures(root: Path) -> str:

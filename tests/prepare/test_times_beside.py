@@ -1,0 +1,102 @@
+"""Times that a text beside frames lists, of clouds and of depth: whose rows are whose, and what doesn't fit is told."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dpcli.store import CloudsReader
+from tests.support.commands import exit_code
+
+SECONDS = np.cumsum([0.0, 0.1, 0.25, 0.1, 0.05, 0.2])
+
+
+def dates(seconds: np.ndarray) -> list[str]:
+    begin = datetime(2011, 9, 26, 23, 59, 59, 750_000)
+    return [str(begin + timedelta(seconds=float(one))) for one in seconds]
+
+
+FORMS = {
+    "seconds": lambda s: [f"{one:.6e}" for one in s],
+    "since 1970": lambda s: [f"{1.7e9 + one:.6f}" for one in s],
+    "milliseconds since 1970": lambda s: [str(round(1.7e12 + one * 1e3)) for one in s],
+    "nanoseconds since 1970": lambda s: [str(1_700_000_000_000_000_000 + round(one * 1e9)) for one in s],
+    "dates": dates,
+    "with a name and a remark": lambda s: ["timestamp", "# of the scanner", *(repr(float(one)) for one in s), ""],
+}
+
+
+def write_frames(folder: Path, kind: str, numbers: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in numbers:
+        if kind == "clouds":
+            np.savetxt(folder / f"{number:06d}.xyz", rng.normal(size=(40, 3)))
+        else:
+            cv2.imwrite(str(folder / f"{number:06d}.png"), rng.integers(500, 900, (6, 8)).astype(np.uint16))
+
+
+def converted(kind: str, raw: Path, out: Path, capfd) -> tuple[np.ndarray | None, str]:
+    more = ("--fov", 60) if kind == "depth" else ()
+    capfd.readouterr()
+    assert exit_code("prepare", kind, raw, "-o", out, "--force", *more) == 0
+    with CloudsReader(out) as reader:
+        return reader.read(0).time, capfd.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["clouds", "depth"])
+@pytest.mark.parametrize("form", FORMS)
+def test_the_times_are_those_of_the_rows(tmp_path, capfd, kind, form):
+    write_frames(tmp_path / "raw" / "drive" / "data", kind, range(6))
+    (tmp_path / "raw" / "drive" / "timestamps.txt").write_text("\n".join(FORMS[form](SECONDS)))
+    time, said = converted(kind, tmp_path / "raw", tmp_path / "a.h5", capfd)
+    np.testing.assert_allclose(time, SECONDS, atol=1e-3 if "milli" in form else 1e-5)
+    assert "its frames have the times in timestamps.txt" in said and "left out" not in said
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_missing_frame_leaves_its_row_out(tmp_path, capfd, first):
+    write_frames(tmp_path, "clouds", [first + n for n in (0, 1, 3, 5)])
+    (tmp_path / "times.txt").write_text("\n".join(FORMS["seconds"](SECONDS)))
+    time, said = converted("clouds", tmp_path, tmp_path / "a.h5", capfd)
+    np.testing.assert_allclose(time, SECONDS[[0, 1, 3, 5]], atol=1e-5)
+    assert "numbered with gaps" in said
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        (["0", "0.1"], "times.txt (2 times for 6 frames)"),
+        (FORMS["seconds"](np.append(SECONDS, [1.0, 1.2])), "times.txt (8 times for 6 frames)"),
+        (["0", "0.1", "0.05", "0.2", "0.3", "0.4"], "times.txt (no times)"),
+        (["a", "b", "1 2", "c", "d", "e"], "times.txt (no times)"),
+        (["0", "1", "2", "3", "4", "5"], "times.txt (no times)"),  # which counts
+        (["0", "0.1", "nan", "0.2", "0.3", "0.4"], "times.txt (no times)"),
+        ([], "times.txt (no times)"),
+    ],
+    ids=range(7),
+)
+def test_a_text_that_does_not_fit_is_named_with_the_reason(tmp_path, capfd, rows, told):
+    write_frames(tmp_path, "clouds", range(6))
+    (tmp_path / "times.txt").write_text("\n".join(rows))
+    time, said = converted("clouds", tmp_path, tmp_path / "a.h5", capfd)
+    assert time is None and f"left out: {told}" in said
+
+
+def test_names_that_are_times_and_a_given_rate_come_first_and_nothing_above_the_folder_is_read(tmp_path, capfd):
+    write_frames(tmp_path / "raw", "clouds", range(6))
+    (tmp_path / "times.txt").write_text("\n".join(FORMS["seconds"](SECONDS)))
+    assert converted("clouds", tmp_path / "raw", tmp_path / "a.h5", capfd)[0] is None
+    (tmp_path / "raw" / "times.txt").write_text("\n".join(FORMS["seconds"](SECONDS)))
+    assert exit_code("prepare", "clouds", tmp_path / "raw", "-o", tmp_path / "b.h5", "--fps", 10) == 0
+    with CloudsReader(tmp_path / "b.h5") as reader:
+        np.testing.assert_allclose(reader.read(0).time, np.arange(6) / 10, atol=1e-6)
+    for old, at in zip(sorted((tmp_path / "raw").glob("*.xyz")), 1.7e9 + np.arange(6) / 2):
+        old.rename(old.with_name(f"{at:.6f}.xyz"))
+    np.testing.assert_allclose(
+        converted("clouds", tmp_path / "raw", tmp_path / "a.h5", capfd)[0], np.arange(6) / 2, atol=1e-5
+    )
