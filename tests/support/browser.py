@@ -20,22 +20,22 @@ _FLAGS = (
     "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update"
     " --disable-sync --hide-scrollbars --dump-dom"
 ).split()
-_TRIES, _SECONDS = 3, 80  # a page takes 2 to 5; on a busy machine a browser may hang while it starts
+_PATIENCE = (30, 60, 80)  # seconds, try by try; a page takes 2 to 5; on a busy machine a browser may hang while it starts
 
 
 def open_page(address: str, folder: Path, *flags: str) -> tuple[str, str]:
     """The page's final HTML and the browser's stderr. A browser that hangs is killed and another one asked."""
-    for attempt in range(_TRIES):
+    for attempt, seconds in enumerate(_PATIENCE):
         command = [BROWSER, *_FLAGS, f"--user-data-dir={folder / f'profile{attempt}'}", *flags, address]
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
         )
         try:
-            return process.communicate(timeout=_SECONDS)
+            return process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)  # its helpers too: they would keep the pipes open
             said = process.communicate()[1]
-    pytest.fail(f"{_TRIES} browsers hung for {_SECONDS} s on {address}: {said[-1000:]}")
+    pytest.fail(f"{len(_PATIENCE)} browsers hung for {_PATIENCE} s on {address}: {said[-1000:]}")
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def held_page() -> Iterator[tuple[str, str]]:
             if self.path == "/done":
                 done.set()
             else:
-                done.wait(_SECONDS / 2)
+                done.wait(40)
             self.send_response(204)
             self.end_headers()
 
