@@ -27,7 +27,11 @@ def guide(prior: Prior, targets: Targets, model: str | None = None) -> ShapeGuid
     if network is not None:
         guided = ShapeGuidance(network, targets)
         if prior == "network" or guided.confidence >= LEAST_CONFIDENCE:
-            log.info(f"shape: {guided.name}, confidence {guided.confidence:.2f}")
+            inflated = ShapeGuidance(Inflated(), targets)
+            log.info(
+                f"shape: {guided.name}, confidence {guided.confidence:.2f}; the depth is {guided.depth_share:.1f} times the"
+                f" larger side in the picture ({inflated.depth_share:.1f} with --prior inflated)"
+            )
             return guided
         log.info(f"shape: inflated silhouette; the network is not sure of this object ({guided.confidence:.2f})")
     elif prior == "auto":

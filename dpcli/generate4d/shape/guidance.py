@@ -12,6 +12,7 @@ from dpcli.generate4d.shape.splats import Splats, splats_of
 from dpcli.generate4d.targets import Targets
 
 SIDE = 128  # pixels at most of the pictures that a prior looks at in a fit
+_OUTERMOST = 0.01, 0.99  # quantiles of points that lie at the ends of an object
 
 
 class ShapeGuidance:
@@ -27,6 +28,14 @@ class ShapeGuidance:
     def confidence(self) -> float:
         """Returns the median of the frames' confidence, 0..1."""
         return float(np.median([frame.confidence for frame in self.layers]))
+
+    @property
+    def depth_share(self) -> float:
+        """Returns how deep the object is along the line of sight, as a share of its larger side in the picture: the median frame's."""
+        clouds = [points_of(frame, self.camera).position for frame in self.layers]
+        turn = self.camera.world_to_camera[:3, :3]
+        sizes = [np.ptp(np.quantile(cloud @ turn.T, _OUTERMOST, axis=0), axis=0) for cloud in clouds if len(cloud)]
+        return float(np.median([depth / max(width, height, 1e-9) for width, height, depth in sizes])) if sizes else 0.0
 
     def pictures(self, frames: list[int], poses: Tensor, intrinsics: Tensor, size: int) -> Tensor:  # [B, S, S, 4]
         """Returns the frames seen by square cameras, f32: color times alpha, and alpha; poses (B,4,4), intrinsics (B,3,3)."""

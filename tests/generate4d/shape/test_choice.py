@@ -13,6 +13,8 @@ from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.optimizer import SceneOptimizer
 from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.guidance import ShapeGuidance
+from dpcli.generate4d.shape.layers import ShapeLayers
 from dpcli.generate4d.shape.model_file import save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.targets import Targets
@@ -39,7 +41,7 @@ def targets():
 @pytest.mark.parametrize(
     ("prior", "offset", "name", "said"),
     [
-        ("auto", 2.0, "network", "shape: network, confidence 0.88"),
+        ("auto", 2.0, "network", "shape: network, confidence 0.88; the depth is"),
         ("auto", -2.0, "inflated", "the network is not sure of this object (0.12)"),
         ("network", -2.0, "network", "shape: network, confidence 0.12"),
         ("inflated", 2.0, "inflated", ""),
@@ -48,6 +50,24 @@ def targets():
 def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, targets, tmp_path, capsys):
     found = guide(prior, targets, _weights(tmp_path / "w.safetensors", offset))
     assert found.name == name and said in capsys.readouterr().err
+
+
+class Bar:
+    """A prior of one bar along the line of sight, from 2 to 3 away, as wide as the picture's middle half."""
+
+    name = "bar"
+
+    def layers(self, pictures, camera):
+        presence = np.zeros((1, 32, 32), np.float32)
+        presence[:, 8:24, 8:24] = 1
+        depth = np.broadcast_to(np.float32([2, 3])[:, None, None], (2, 32, 32))
+        return [ShapeLayers(depth, presence, np.zeros((2, 3, 32, 32), np.float32)) for _ in pictures]
+
+
+def test_how_deep_an_object_is_beside_its_larger_side(targets):
+    """The back of the bar is seen as large as its front and is farther away, so it is the larger side: 1 / (3 x 15 / f)."""
+    focal = float(targets.intrinsics[0, 0, 0])
+    assert ShapeGuidance(Bar(), targets).depth_share == pytest.approx(focal / 45, rel=0.03)
 
 
 def test_without_weights_auto_inflates_and_says_so(targets, tmp_path, monkeypatch, capsys):
