@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import path_inside
@@ -175,7 +176,9 @@ class OgcRooms:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
-        lines = [f"{len(items)} rooms ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"]
+        lines = [
+            f"{counted(len(items), 'room')} ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"
+        ]
         if len(items) != ROOMS:
-            lines.append(f"{len(items)} rooms where the published set has {ROOMS}")
+            lines.append(f"{counted(len(items), 'room')} where the published set has {ROOMS}")
         return lines

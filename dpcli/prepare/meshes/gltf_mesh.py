@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.gltf_extensions import decompress, instances
@@ -184,7 +185,7 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
     primitives = file.item("meshes", node["mesh"]).get("primitives", [])
     kept = [p for p in primitives if p.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)]
     if len(kept) < len(primitives):
-        left = f"{len(primitives) - len(kept)} of {len(primitives)} pieces"
+        left = f"{len(primitives) - len(kept)} of {counted(len(primitives), 'piece')}"
         log.warn(f"{file.path}: points and lines of {node_name(file, index)!r} are left out, {left}")
     skins = _read_skin(file, node["skin"]) if "skin" in node else None
     pieces = [_read_primitive(file, index, primitive, skins) for primitive in kept]

@@ -281,7 +281,9 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
         good.append(frame)
         boxes.append(row)
     if not good:
-        raise DataError(f"{motion.name}: none of its {len(frames)} frames is whole in all of cameras {_ranges(views)}")
+        raise DataError(
+            f"{motion.name}: none of its frames ({len(frames)}) is whole in all of cameras {_ranges(views)}"
+        )
     if cut_off:
         log.warn(f"the object leaves the picture in {first_names(cut_off, 8)}")
     if len(good) == 1:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.color_frames import Frames, open_frames
@@ -62,7 +63,7 @@ class ArtemisIndex:
         faults = [f"{count} of the {declared} frames are there"] if count < declared else []
         lacking = [*_lacking_pictures(motion, cameras), *self._lacking_bones(motion)]
         if lacking:
-            faults.append(f"{len(lacking)} files are missing, the first: {lacking[0]}")
+            faults.append(f"{counted(len(lacking), 'file')} missing, the first: {lacking[0]}")
         return "; ".join(faults)
 
     def _lacking_bones(self, motion: Motion) -> Iterator[str]:
