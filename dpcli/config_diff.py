@@ -17,24 +17,26 @@ _NOUNS = {
 
 def differences(before: object, now: object) -> list[str]:
     """Returns one phrase for each setting that isn't the same, nested ones by their path; what is too long to be told, or a
-    digest, is named without its values, and before the others.
+    digest, is named without its values: before the others, if it isn't nested.
 
     >>> differences({"frames": 16, "weights": "0" * 64}, {"frames": 24, "weights": "1" * 64})
     ['other weights', 'frames 16, now 24']
     """
     old, new = _settings(before), _settings(now)
     pairs = {name: (old.get(name, "absent"), new.get(name, "absent")) for name in sorted(old.keys() | new.keys())}
-    named, told = [], []
+    first, told, last = [], [], []
     for name, (was, is_now) in pairs.items():
-        if was != is_now and (max(len(was), len(is_now)) > _LONG or _DIGEST.search(was + is_now)):
-            named.append(f"other {_noun(name)}")
-        elif was != is_now:
+        if was != is_now and max(len(was), len(is_now)) <= _LONG and not _DIGEST.search(was + is_now):
             told.append(f"{name} {was}, now {is_now}")
-    return named + told
+        elif was != is_now:
+            (last if "." in name else first).append(f"other {_noun(name)}")
+    return first + told + last
 
 
 def _noun(path: str) -> str:
     above, _, name = path.rpartition(".")
+    if name.isdigit():
+        return f"file {int(name) + 1} of {above}"
     name = name.removesuffix("_digest")
     return _NOUNS.get(name, name.replace("_", " ")) + (f" ({above})" if above else "")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numba
 from numba.core import event
 from numba.core.caching import FunctionCache
+from numba.core.sigutils import normalize_signature
 
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import load_numba_without_blas
@@ -81,11 +82,15 @@ class _KernelCache(FunctionCache):
         file._source_stamp = (file._source_stamp, SHARED_CODE)  # numba's own stamp is of the kernel's file alone
 
     def load_overload(self, sig: object, target_context: object) -> object:
-        """Returns the compiled kernel, or None where there is none or it can't be read."""
+        """Returns the compiled kernel, or None where there is none, it can't be read, or it is one for other types.
+
+        Processes that compile one kernel for different types at the same time may each give its file the same name.
+        """
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception:  # a pickle's bytes decide what is raised
             return None
+        return found if found is None or found.signature.args == normalize_signature(sig)[0] else None
 
     def save_overload(self, sig: object, data: object) -> None:
         """Writes the compiled kernel; a second time over an index that can't be read; or not at all."""

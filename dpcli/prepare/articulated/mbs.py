@@ -135,7 +135,9 @@ class MultiBodySync:
                 items.append(Item(name, path, split=_SPLITS[split], extra={"parts": parts}, problem=problem))
         twice = len(items) - len({item.name for item in items})
         if twice:
-            raise DataError(f"{self.raw / 'meta.json'}: {twice} numbers are listed twice; a sample is in one split")
+            raise DataError(
+                f"{self.raw / 'meta.json'}: {counted(twice, 'number')} listed twice; a sample is in one split"
+            )
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

@@ -77,7 +77,9 @@ def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndar
             raise DataError(f"{folder / f'pc_{t:02d}.npy'}: holds NaN or infinity; expected finite coordinates")
         pose = read_poses(folder / f"pose_{t:02d}.npy")
         if poses and len(pose) != len(poses[0]):
-            raise DataError(f"{folder / f'pose_{t:02d}.npy'}: {len(pose)} objects, {len(poses[0])} in pose_00.npy")
+            raise DataError(
+                f"{folder / f'pose_{t:02d}.npy'}: {counted(len(pose), 'object')}, {len(poses[0])} in pose_00.npy"
+            )
         clouds.append(cloud.astype(np.float32))
         parts.append(read_segmentation(folder / f"segm_{t:02d}.npy", len(pose), len(cloud)))
         poses.append(pose)

@@ -185,7 +185,7 @@ def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
     except DataError as error:
         return str(error), 0
     if missing:
-        more = f", as are {len(missing) - 1} others" if len(missing) > 1 else ""
+        more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0
     if not skeleton.joints:
         return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0

@@ -298,7 +298,9 @@ def _whole_normals(file: Gltf, normals: np.ndarray, computed: np.ndarray, where:
     """Returns normals f32 (V,3), those that are not finite computed from the triangles, with a warning."""
     lost = ~np.isfinite(normals).all(1)
     if lost.any():
-        log.warn(f"{file.path}: {where}: {lost.sum()} normals are NaN or infinite; computed from the triangles")
+        log.warn(
+            f"{file.path}: {where}: {counted(int(lost.sum()), 'normal')} NaN or infinite; computed from the triangles"
+        )
         normals = np.where(lost[:, None], computed, normals)
     return normals
 
@@ -376,7 +378,9 @@ def _repaired(
     if lost.any():
         from scipy.spatial import cKDTree
 
-        log.warn(f"{file.path}: {where}: {lost.sum()} vertices without finite weights follow their nearest neighbors")
+        log.warn(
+            f"{file.path}: {where}: {counted(int(lost.sum()), 'vertex', 'vertices')} without finite weights: as the nearest ones"
+        )
         near = np.flatnonzero(~lost)[cKDTree(positions[~lost]).query(positions[lost])[1]]
         local, weights = local.copy(), weights.copy()
         local[lost], weights[lost] = local[near], weights[near]

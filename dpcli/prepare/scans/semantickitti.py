@@ -190,7 +190,9 @@ class SemanticKitti:
             return np.tile(np.eye(4), (len(numbers), 1, 1))
         poses = read_poses(item.path / "poses.txt")
         if numbers[-1] >= len(poses):
-            raise DataError(f"{item.path / 'poses.txt'}: {len(poses)} lines, none for scan {item.extra['scans'][-1]}")
+            raise DataError(
+                f"{item.path / 'poses.txt'}: {counted(len(poses), 'line')}, none for scan {item.extra['scans'][-1]}"
+            )
         return np.linalg.inv(poses[numbers[0]]) @ poses[numbers]
 
     def summary(self, items: list[Item]) -> list[str]:

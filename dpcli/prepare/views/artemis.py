@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
@@ -144,7 +145,9 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
 def _read_rig(animal: Path) -> _Rig:
     to_world, intrinsics = read_poses(animal / "CamPose.inf"), read_intrinsics(animal / "Intrinsic.inf")
     if len(to_world) != len(intrinsics):
-        raise DataError(f"{animal}: CamPose.inf has {len(to_world)} cameras, Intrinsic.inf {len(intrinsics)}")
+        raise DataError(
+            f"{animal}: CamPose.inf has {counted(len(to_world), 'camera')}, Intrinsic.inf {len(intrinsics)}"
+        )
     return _Rig(intrinsics, np.linalg.inv(to_world))
 
 

@@ -36,7 +36,9 @@ class ArtemisIndex:
         """
         poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
         if len(poses) != len(cameras):
-            raise DataError(f"{self.animal}: CamPose.inf has {len(poses)} cameras, Intrinsic.inf {len(cameras)}")
+            raise DataError(
+                f"{self.animal}: CamPose.inf has {counted(len(poses), 'camera')}, Intrinsic.inf {len(cameras)}"
+            )
         images, declared = require_folder(self.animal / "img", "MOTION/FRAME/"), declared_frames(self.animal)
         there = {path.name for path in images.iterdir() if path.is_dir()}
         names = [self.motion] if self.motion else sorted(there | declared.keys())
@@ -54,7 +56,7 @@ class ArtemisIndex:
         except DataError as error:
             return f"{self.animal / 'sequences'}: {error}"
         if not folder.is_dir():
-            return f"img/{name}: missing" + (f"; sequences gives it {declared} frames" if declared else "")
+            return f"img/{name}: missing" + (f"; sequences gives it {counted(declared, 'frame')}" if declared else "")
         try:
             motion = find_motion(self.animal, name)
         except DataError as error:

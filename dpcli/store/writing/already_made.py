@@ -57,5 +57,9 @@ def _describe_differences(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Returns the first settings that differ, and the inputs that are other files, in words."""
     old, new = ({**entry.get("config", {}), **{key: entry.get(key) for key in _PLAIN}} for entry in (before, now))
     inputs, own = before.get("inputs") or {}, now.get("inputs") or {}
-    others = [f"another {role} file" for role in sorted({*inputs, *own}) if inputs.get(role) != own.get(role)]
+    others = [
+        f"another {f'file {int(role) + 1}' if role.isdigit() else f'{role} file'}"
+        for role in sorted({*inputs, *own})
+        if inputs.get(role) != own.get(role)
+    ]
     return "with " + ("; ".join([*differences(old, new), *others][:_NAMED]) or "other settings")

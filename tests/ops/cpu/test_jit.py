@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ast
 import os
-import runpy
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -50,11 +50,13 @@ def compiled(tmp_path, monkeypatch):
     """Calls a kernel for the first time in this process, so to say; returns whether it was found in the cache."""
     (tmp_path / "own.py").write_text(TWICE)
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
-    function = runpy.run_path(str(tmp_path / "own.py"))["twice"].py_func
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    function = import_module("own").twice.py_func
 
-    def call() -> bool:
+    def call(number: float = 3.0) -> bool:
         kernel = jit.kernel(function)
-        assert kernel(3.0) == 6.0
+        assert kernel(number) == 2 * number
         return bool(kernel.stats.cache_hits)
 
     return call
@@ -67,6 +69,14 @@ def test_a_damaged_cache_is_written_anew(compiled, tmp_path, ending):
     (file,) = (tmp_path / "cache").rglob(f"*.{ending}")
     file.write_bytes(b"")
     assert [compiled(), compiled()] == [False, True]
+
+
+def test_code_for_other_types_is_not_taken(compiled, tmp_path):
+    """Two processes that had each just compiled a kernel could overwrite each other's code, but not its place in the index."""
+    assert [compiled(0.5), compiled(1 << 40)] == [False, False]
+    one, other = sorted((tmp_path / "cache").rglob("*.nbc"))
+    one.write_bytes(other.read_bytes())
+    assert [compiled(0.5), compiled(0.5), compiled(1 << 40)] == [False, True, True]
 
 
 def test_a_cache_that_takes_nothing_is_done_without(compiled, monkeypatch, capsys):
