@@ -29,16 +29,16 @@ def differences(before: object, now: object) -> list[str]:
         if was != is_now and max(len(was), len(is_now)) <= _LONG and not _DIGEST.search(was + is_now):
             told.append(f"{name} {was}, now {is_now}")
         elif was != is_now:
-            (last if "." in name else first).append(f"other {_noun(name)}")
+            (last if "." in name else first).append(_other(name))
     return first + told + last
 
 
-def _noun(path: str) -> str:
+def _other(path: str) -> str:
     above, _, name = path.rpartition(".")
-    if name.isdigit():
-        return f"file {int(name) + 1} of {above}"
+    if above == "inputs":  # files by their role, or their place among equals
+        return f"another file {int(name) + 1}" if name.isdigit() else f"another {name} file"
     name = name.removesuffix("_digest")
-    return _NOUNS.get(name, name.replace("_", " ")) + (f" ({above})" if above else "")
+    return f"other {_NOUNS.get(name, name.replace('_', ' '))}" + (f" ({above})" if above else "")
 
 
 def _settings(value: object, path: str = "") -> dict[str, str]:

@@ -264,7 +264,7 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
     stopped_after(2, monkeypatch, [two[0], again], out)
     assert journal.exists()
     with pytest.raises(
-        UsageError, match='with other settings or inputs .config.merge ."a.h5", "c.h5"., now .*; other file 1 of inputs'
+        UsageError, match='with other settings or inputs .config.merge ."a.h5", "c.h5"., now .*; another file 1'
     ):
         merge([again, two[0]], out)
     assert journal.exists()
