@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 
 MEANS = ("arithmetic", "geometric")
@@ -38,7 +39,9 @@ def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -
     except ValueError:
         raise UsageError(f"--weights {text}: expected numbers with commas, such as 0.5,0.5") from None
     if len(values) != len(names):
-        raise UsageError(f"--weights {text}: {len(values)} weights for {len(names)} files; one for each")
+        raise UsageError(
+            f"--weights {text}: {counted(len(values), 'weight')} for {counted(len(names), 'file')}; one for each"
+        )
     if not np.isfinite(values).all() or values.min() < 0 or not 0 < values.sum() < np.inf:
         raise UsageError(f"--weights {text}: expected numbers from 0 up, not all of them 0")
     return values / values.sum()

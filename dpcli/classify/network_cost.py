@@ -14,6 +14,7 @@ from dpcli.classify.network.backbones.interface import Stage
 from dpcli.classify.network.kinematic import Kinematics
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network_speed import body_like_clip, latency, steps
+from dpcli.counted import counted
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.device import peak_memory
 
@@ -137,7 +138,7 @@ def _peak(device: torch.device, before: int) -> float:
 def render(result: dict[str, Any]) -> str:
     """Returns the object of `measure` as lines for a person."""
     lines = [
-        f"Kinet on {result['backbone']}, {result['variant']} variant, {result['classes']} classes,"
+        f"Kinet on {result['backbone']}, {result['variant']} variant, {counted(result['classes'], 'class')},"
         f" clip {result['clip'][0]} x {result['clip'][1]} points"
     ]
     parameters = result["parameters"]
@@ -154,7 +155,9 @@ def render(result: dict[str, Any]) -> str:
     lines.append(f"  paper style {gflops['total']} GFLOPs, static {gflops['static']}: {gflops['rule']}")
     lines.append(f"  not counted: {result['uncounted']}")
     times = ", ".join(f"{key} {value}" for key, value in result["latency_ms"].items())
-    lines.append(f"latency       {times} ms on {result['device']} with {result['threads']} threads, one clip at a time")
+    lines.append(
+        f"latency       {times} ms on {result['device']} with {counted(result['threads'], 'thread')}, one clip at a time"
+    )
     lines.append(f"peak memory   {result['peak_memory_mb']} MB of the process")
     for key in ("static_step", "dynamic_step", "inference"):
         lines += _step_lines(key.replace("_", " "), result[key]) if key in result else []
@@ -165,8 +168,8 @@ def _step_lines(name: str, step: dict[str, Any]) -> list[str]:
     parts = ", ".join(f"{part.replace('_', ' ')} {value}" for part, value in step["ms_per_clip"].items() if value)
     dense, sparse = (100 * step[f"{kind}_products_share"] for kind in ("matrix", "sparse"))
     return [
-        f"{name:<13} {step['batch'] / step['seconds']:.3g} clips/s: {step['seconds']} s for {step['batch']} clips with"
-        f" {step['threads']} threads, {step['seconds_on_one_thread']} s with one,",
+        f"{name:<13} {step['batch'] / step['seconds']:.3g} clips/s: {step['seconds']} s for {counted(step['batch'], 'clip')} with"
+        f" {counted(step['threads'], 'thread')}, {step['seconds_on_one_thread']} s with one,",
         f"              of which {dense:.0f} % in matrix products"
         + (f" and {sparse:.0f} % in sparse ones" if sparse else ""),
         f"  per clip    {parts} ms",

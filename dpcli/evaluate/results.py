@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.text_tables import TextTable
@@ -103,9 +104,9 @@ def list_names(names: Sequence[str]) -> str:
 
 
 def left_out_note(entry: LeftOut, kind: str = "", *, named: bool = True) -> str:
-    """Returns a sentence of how many samples (of `kind`, in words) were left out and why, with a few names if `named`."""
+    """Returns a sentence of how many samples (of `kind`, a noun in the singular) were left out and why, with a few names if `named`."""
     shown = first_names(entry.names, _NAMES_IN_NOTE)
-    count = f"{len(entry.names)} {kind}".rstrip()
+    count = counted(len(entry.names), kind) if kind else str(len(entry.names))
     return f"Left out, {entry.reason}: {count}{f' ({shown})' if named else ''}."
 
 

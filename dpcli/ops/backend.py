@@ -110,6 +110,15 @@ def _is_finite(tensor: torch.Tensor) -> bool:
     return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
 
+def check_rows(idx: torch.Tensor, count: int) -> None:
+    """Checks that indices of `count` rows lie in 0..count-1, which kernels take on trust; on a GPU that look would stall the stream.
+
+    Raises ValueError.
+    """
+    if idx.device.type == "cpu" and idx.numel() and not (0 <= int(idx.min()) and int(idx.max()) < count):
+        raise ValueError(f"idx must lie in 0..{count - 1}, but spans {int(idx.min())}..{int(idx.max())}")
+
+
 def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:
     """Checks ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
     if lengths is None:

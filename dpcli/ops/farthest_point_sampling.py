@@ -53,6 +53,8 @@ def _checked(
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     points = positions("points", points)
     batch, count, _ = points.shape
+    if count == 0:
+        raise ValueError(f"points {tuple(points.shape)} hold no point")
     lengths = row_lengths(lengths, batch, count, points.device)
     shortest = count if lengths is None else int(lengths.min()) if batch else count
     if num_samples < 1:

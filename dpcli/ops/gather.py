@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend, run_in_threads
+from dpcli.ops.backend import check_rows, chosen_backend, run_in_threads
 
 _ENTRY_NS = 0.4  # measured, per number that is added
 
@@ -52,9 +52,7 @@ def gather_mean(features: Tensor, idx: Tensor) -> Tensor:
 def _check(features: Tensor, idx: Tensor) -> None:
     if features.ndim != 3 or idx.ndim < 1 or idx.shape[0] != features.shape[0]:
         raise ValueError(f"features (B,N,C) and idx (B,...) do not fit: {tuple(features.shape)}, {tuple(idx.shape)}")
-    count = features.shape[1]
-    if idx.device.type == "cpu" and idx.numel() and not (0 <= int(idx.min()) and int(idx.max()) < count):
-        raise ValueError(f"idx must lie in 0..{count - 1}, but spans {int(idx.min())}..{int(idx.max())}")
+    check_rows(idx, features.shape[1])
 
 
 class _GatherMean(torch.autograd.Function):

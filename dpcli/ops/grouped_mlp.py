@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend
+from dpcli.ops.backend import check_rows, chosen_backend
 from dpcli.ops.cpu.cache_blocks import TASKS, ranges, share_tasks, steps
 from dpcli.ops.cpu.parallel import parallel_kernels
 from dpcli.ops.gather import gather_points
@@ -52,7 +52,7 @@ def grouped_mlp(
 
     Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
     Differentiable in features, weights, biases and norms; not in positions. The fast path takes float32, C1 in eights and
-    C2 of 8 or more.
+    C2 of 8 or more. Raises ValueError, on CPU, on an index out of range.
     """
     fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
     fast = (
@@ -126,6 +126,7 @@ def _frozen_pieces(
     linear1: tuple[Tensor, Tensor],
     linear2: tuple[Tensor, Tensor],
 ) -> tuple[list[Tensor], Tensor]:
+    check_rows(idx, points.shape[1])
     kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
     if features is None:  # cheaper from positions than gathered: the projected points are many
         make = kernels.hidden_xyz
@@ -179,6 +180,7 @@ def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor
 
 
 def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):
+    check_rows(idx, points.shape[1])
     weight1, bias1 = linear1
     inputs = (points.detach().contiguous(), centers.detach().contiguous(), idx.contiguous())
     table, offset = (None, None) if features is None else _project(points, centers, features, linear1)

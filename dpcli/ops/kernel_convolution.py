@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend, run_in_threads
+from dpcli.ops.backend import check_rows, chosen_backend, run_in_threads
 
 _FMA_NS = 0.08  # measured: per multiply-add of the kernels, one core
 _CENTERS = 64  # whose sums are held at a time: a few MiB, which stay in the cache between the steps
@@ -20,7 +20,8 @@ def kernel_convolution(features: Tensor, index: Tensor, weight: Tensor, slot: Te
     positions that the group permutes; slot (G,D) i64, the position that rotation g makes of kernel point k;
     matrix (D*C,C'), rows kernel point by kernel point. -> (B,P,G,C'). Differentiable in features and matrix only.
     Backends: numba on CPU (skips zero weights; sums are made again for the gradient, so nothing of size P*G*D*C or
-    P*G*D*n is kept), torch elsewhere; equal to rounding. Raises ValueError on shapes that don't fit.
+    P*G*D*n is kept), torch elsewhere; equal to rounding. Raises ValueError on shapes that don't fit and, on CPU, on an
+    index out of range.
     """
     _check(features, index, weight, slot, matrix)
     if features.dtype == torch.float32 and chosen_backend(features.device) == "numba":
@@ -53,6 +54,7 @@ def _check(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix
     if not fits:
         shapes = ", ".join(str(tuple(t.shape)) for t in (features, index, weight, slot, matrix))
         raise ValueError(f"features (B,N,G,C), index (B,P,n), weight (B,P,n,D), slot (G,D), matrix (D*C,C'): {shapes}")
+    check_rows(index, features.shape[1])
 
 
 class _Sums:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.text_files import read_json, read_toml
 
@@ -101,7 +102,7 @@ def _require_equal(sources: Sequence[tuple[Path, list[str]]]) -> None:
     for path, names in sources:
         if names != first:
             raise DataError(
-                f"{path}: its {len(names)} classes ({_some(names)}) are not the {len(first)} of {first_path} "
+                f"{path}: {counted(len(names), 'class')} ({_some(names)}), other than the {len(first)} of {first_path} "
                 f"({_some(first)}); --labels map.toml says which is which"
             )
 

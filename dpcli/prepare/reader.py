@@ -134,7 +134,7 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
     if len(counts) == 0:
         raise DataError(f"{name}: holds no frames; expected at least 1")
     if len(kept) == 0:
-        raise DataError(f"{name}: none of its {len(counts)} frames has a valid depth pixel or point")
+        raise DataError(f"{name}: none of its frames ({len(counts)}) has a valid depth pixel or point")
     dropped = len(counts) - len(kept)
     return kept, {"frames without points dropped": dropped} if dropped else {}
 

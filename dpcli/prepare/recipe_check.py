@@ -257,7 +257,7 @@ def _index_lines(reader: Any, errors: list[str]) -> Iterator[str]:
     for line in reader.summary(items):
         log.info(line)
     good, bad = len(items) - len(bad), bad + unread
-    yield f"{'MISSING ' if bad else 'ok      '} index: {good} samples to convert, {len(bad)} that cannot be"
+    yield f"{'MISSING ' if bad else 'ok      '} index: {counted(good, 'sample')} to convert, {len(bad)} that cannot be"
     for item in bad[:_SHOWN]:
         yield f"           {item.name}: {item.problem}"
     if len(bad) > _SHOWN:

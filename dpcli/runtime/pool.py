@@ -48,9 +48,9 @@ def at_most(seconds: float) -> Iterator[None]:
         signal.setitimer(signal.ITIMER_PROF, 0)
 
 
-def _start_worker(debug: bool) -> None:
+def _start_worker(debug: bool, level: int) -> None:
     """Leaves it to the parent when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
-    _worker.apart = True
+    _worker.apart, log.level = True, level
     if not debug:
         quiet_libraries()
     os.dup2(2, 1)  # nothing that a library prints is a result
@@ -85,7 +85,7 @@ def _new_pool(jobs: int) -> ProcessPoolExecutor:
     """Raises DpcError where the machine has no place for what processes share, as some containers without /dev/shm."""
     ensure_server()
     try:
-        return ProcessPoolExecutor(min(jobs, _MOST), _Workers(), _start_worker, (log.debug,))
+        return ProcessPoolExecutor(min(jobs, _MOST), _Workers(), _start_worker, (log.debug, log.level))
     except (OSError, ImportError) as error:
         said = error.strerror if isinstance(error, OSError) else error
         raise DpcError(

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, reading
 from dpcli.store.file import (
     absent,
@@ -63,7 +64,9 @@ class CloudsReader:
                 f"{self.path}: sequence_offsets end at {frames}, but there are {len(self._frame_offsets) - 1} frames"
             )
         if not len(self.names) == len(self.splits) == len(self._sequence_offsets) - 1:
-            raise DataError(f"{self.path}: {len(self.names)} names for {len(self._sequence_offsets) - 1} sequences")
+            raise DataError(
+                f"{self.path}: {counted(len(self.names), 'name')} for {counted(len(self._sequence_offsets) - 1, 'sequence')}"
+            )
         if len(set(self.names)) != len(self.names):
             twice = next(name for k, name in enumerate(self.names) if name in self.names[:k])
             raise DataError(
@@ -72,7 +75,7 @@ class CloudsReader:
         if self.class_names and len(self.labels) and self.labels.max() >= len(self.class_names):
             worst = int(self.labels.argmax())
             raise DataError(
-                f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes"
+                f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {counted(len(self.class_names), 'class')}"
             )
         if "class_names" not in file and (self.labels >= 0).any():
             raise DataError(
@@ -183,7 +186,9 @@ class CloudsReader:
             else np.asarray(frames)
         )
         if len(wanted) == 0 or wanted.min() < 0 or wanted.max() >= count:
-            raise DataError(f"{self.path}: frames {frames} of {self.names[index]!r}, which has {count} frames")
+            raise DataError(
+                f"{self.path}: frames {frames} of {self.names[index]!r}, which has {counted(count, 'frame')}"
+            )
         low, high = int(wanted.min()), int(wanted.max()) + 1
         offsets = self._frame_offsets[first + low : first + high + 1]
         span = slice(int(offsets[0]), int(offsets[-1]))

@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import CloudsWriter
@@ -61,7 +62,9 @@ class PartsSample:
 
     def _check_flow(self, sequence: CloudSequence, where: str) -> None:
         if len(self.flow) != len(self.pairs):
-            raise DataError(f"{where}: flow of {len(self.flow)} pairs, expected {len(self.pairs)}, one array for each")
+            raise DataError(
+                f"{where}: flow of {counted(len(self.flow), 'pair')}, expected {len(self.pairs)}, one array for each"
+            )
         sizes = np.diff(sequence.frame_offsets)
         for (source, target), flow in zip(self.pairs.tolist(), self.flow, strict=True):
             if flow.shape != (sizes[source], 3):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.store.joints import PARENT, TYPE, TYPES, no_joints
 from dpcli.store.schema import KEPT, TABLES
@@ -134,7 +135,7 @@ class CloudSequence:
             if not bad:
                 raise DataError(f"{where}: holds {NO_LENGTHS}; drop such points before writing")
             raise DataError(
-                f"{where}: {bad} of {len(self.points)} points are NaN or infinite; drop them before writing"
+                f"{where}: {bad} of {counted(len(self.points), 'point')} NaN or infinite; drop them before writing"
             )
         if self.label < -1 or (num_classes and self.label >= num_classes):
             raise DataError(

@@ -10,6 +10,7 @@ from types import TracebackType
 import h5py
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, reading
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
@@ -179,7 +180,7 @@ class ViewsWriter:
         views, frames = self._written.shape
         if not (0 <= view < views and 0 <= frame < frames):
             raise DataError(
-                f"{self.header.name!r}: view {view}, frame {frame}; there are {views} views, {frames} frames"
+                f"{self.header.name!r}: view {view}, frame {frame}; expected one of {counted(views, 'view')} and {counted(frames, 'frame')}"
             )
         if rgba.shape != self._rgba.shape[2:] or rgba.dtype != np.uint8:
             raise DataError(
@@ -286,7 +287,8 @@ class ViewsReader:
         """Reads the picture u8 (H,W,4) of a view at a frame, straight alpha. One chunk is read."""
         if not (0 <= view < self.num_views and 0 <= frame < self.num_frames):
             raise DataError(
-                f"{self.path}: view {view}, frame {frame}; the file has {self.num_views} views, {self.num_frames} frames"
+                f"{self.path}: view {view}, frame {frame}; the file has {counted(self.num_views, 'view')}"
+                f" and {counted(self.num_frames, 'frame')}"
             )
         with reading(f"{self.path}: view {view}, frame {frame}"):
             return self._rgba[view, frame]

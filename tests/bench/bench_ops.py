@@ -20,7 +20,10 @@ import torch
 
 from dpcli import ops
 from dpcli.errors import DpcError
+from dpcli.ops.kernel_convolution import kernel_convolution, kernel_convolution_reference
 from dpcli.ops.open3d_import import load_open3d
+from dpcli.ops.rigid import rigid_flow_reference, weighted_kabsch_reference
+from dpcli.runtime.tuning import keep_freed_memory
 from tests.support.ops_helpers import backend
 
 
@@ -160,12 +163,57 @@ def value_rows() -> Iterator[tuple]:
         with_gradient(under("torch", lambda f: ops.gather_points(f, idx)), features),
         ("torch.gather", with_gradient(lambda f: f.gather(1, flat).view(*idx.shape, -1), features)),
     )
+    gathered = ops.gather_points(features, idx)
+    plain, ahead = under("torch", lambda f: ops.gather_points(f, idx))(features), torch.ones_like(gathered)
+    yield (
+        "gradient of the same alone",
+        lambda: torch.autograd.grad(gathered, features, ahead, retain_graph=True)[0],
+        lambda: torch.autograd.grad(plain, features, ahead, retain_graph=True)[0],
+        ("-", None),
+    )
+    yield (
+        "mean of the same, with gradient",
+        with_gradient(lambda f: ops.gather_mean(f, idx), features),
+        with_gradient(under("torch", lambda f: ops.gather_mean(f, idx)), features),
+        ("torch.gather", with_gradient(lambda f: f.gather(1, flat).view(*idx.shape, -1).mean(2), features)),
+    )
     query, points = (torch.randn(16, n, 3, generator=generator) for n in (1024, 512))
     values = torch.randn(16, 512, 88, generator=generator).requires_grad_()
     yield (
         "3-NN interpolation 16 x 512 -> 1024 x 88, with gradient",
         with_gradient(lambda f: ops.three_nn_interpolate(query, points, f), values),
         with_gradient(under("torch", lambda f: ops.three_nn_interpolate(query, points, f)), values),
+        ("-", None),
+    )
+
+
+def rigid_rows() -> Iterator[tuple]:
+    """What `segment predict` asks of four frames: eight slots' motions, and a layer of its network."""
+    generator = torch.Generator().manual_seed(0)
+    points, mask = torch.randn(4, 512, 3, generator=generator), torch.rand(4, 512, 8, generator=generator)
+    moved = points @ ops.quaternion_to_matrix(torch.tensor([0.8, 0.6, 0.0, 0.0])).mT + 1.0
+    motions = weighted_kabsch_reference(points, moved, mask)
+    yield (
+        "weighted Kabsch 4 x 512, 8 slots",
+        lambda: ops.weighted_kabsch(points, moved, mask),
+        lambda: weighted_kabsch_reference(points, moved, mask),
+        ("-", None),
+    )
+    yield (
+        "rigid flow 4 x 512, 8 slots",
+        lambda: ops.rigid_flow(points, mask, *motions),
+        lambda: rigid_flow_reference(points, mask, *motions),
+        ("-", None),
+    )
+    index = ops.knn(points[:, ::4], points, 32)[1]
+    weight = torch.relu(torch.rand(*index.shape, 13, generator=generator) - 0.75)  # three in four are zero
+    slot = torch.stack([torch.randperm(13, generator=generator) for _ in range(12)])
+    layer = (index, weight, slot, torch.randn(13 * 32, 64, generator=generator))
+    features = torch.randn(4, 512, 12, 32, generator=generator).requires_grad_()
+    yield (
+        "SE(3) convolution 4 x 512, 12 rotations, with gradient",
+        with_gradient(lambda f: kernel_convolution(f, *layer), features),
+        with_gradient(lambda f: kernel_convolution_reference(f, *layer), features),
         ("-", None),
     )
 
@@ -187,9 +235,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeat", type=int, default=5)
     repeat = parser.parse_args().repeat
+    keep_freed_memory()  # as `dpc` does: else pages that are new to each call take longer than their contents
     print(f"{torch.get_num_threads()} torch threads; median of {repeat} after one call; ms")
     print(f"{'operation':58} {'ours':>8} {'torch':>8} {'ratio':>6} {'results':>9}  instead")
-    for rows in (fps_rows, ball_rows, knn_rows, value_rows):
+    for rows in (fps_rows, ball_rows, knn_rows, value_rows, rigid_rows):
         for title, ours, reference, (other, theirs) in rows():
             results = agree(ours(), reference())
             fast, slow = median_ms(ours, repeat), median_ms(reference, repeat)

@@ -203,9 +203,9 @@ def test_mixtures_are_refused_with_what_differs(folder, tmp_path, monkeypatch, c
     base, first = list(COMMANDS["scores"]), tmp_path / "0.h5"
     assert exit_code(*base, "--shard", "0/2", "-o", first) == 0
     other = {
-        "weights ": [*base[:4], tmp_path / "other.safetensors", *base[5:]],
+        "other weights": [*base[:4], tmp_path / "other.safetensors", *base[5:]],
         "clips_per_video 1, now absent": [*base, "--clips-per-video", "1"],
-        "inputs.clouds ": [*base[:2], tmp_path / "videos.h5", *base[3:]],
+        "another clouds file": [*base[:2], tmp_path / "videos.h5", *base[3:]],
         "seed 4, now 0": [*base, "--seed", "4"],
         "holds parts": list(COMMANDS["parts"]),
     }

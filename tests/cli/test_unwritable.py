@@ -263,7 +263,7 @@ def test_the_sample_that_found_no_room_is_not_counted_as_kept(tmp_path, monkeypa
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with (
-        pytest.raises(DiskFull, match="the 1 samples done are kept"),
+        pytest.raises(DiskFull, match="what is done, 1 sample, is kept"),
         CloudsWriter(tmp_path / "o.h5", resume=True) as writer,
     ):
         writer.write(CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2))

@@ -50,7 +50,7 @@ def test_processes_and_shards_fit_the_same_scenes(clips, tmp_path, dpc, dpc_here
 def test_a_bad_clip_is_named_and_the_others_are_fitted(clips, tmp_path, dpc_here):
     done = dpc_here("generate4d", "fit", clips / "c.h5", clips / "a.h5", "-o", tmp_path / "out", *OPTIONS)
     assert done.returncode == 3 and done.stdout == f"{tmp_path / 'out'}: 1 scene\n".encode()
-    assert b"1 clips have no scene: " in done.stderr and b"c.h5" in done.stderr
+    assert b"no scene of 1 clip: " in done.stderr and b"c.h5" in done.stderr
     assert (tmp_path / "out" / "a.h5").exists() and not (tmp_path / "out" / "c.h5").exists()
 
 

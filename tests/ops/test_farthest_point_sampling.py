@@ -102,6 +102,7 @@ def test_accepts_views_doubles_and_gradients(name: str) -> None:
     [
         (dict(points=torch.zeros(5, 3)), "shape"),
         (dict(points=torch.zeros(1, 5, 2)), "shape"),
+        (dict(points=torch.zeros(1, 0, 3)), "hold no point"),
         (dict(points=torch.zeros(1, 5, 3, dtype=torch.int64)), "floating"),
         (dict(points=torch.tensor([[[0.0, float("nan"), 0.0]]])), "NaN"),
         (dict(points=torch.tensor([[[0.0, float("inf"), 0.0]]])), "NaN"),

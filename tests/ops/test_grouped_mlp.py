@@ -249,3 +249,12 @@ def test_torch_backend_is_used_when_asked_for(monkeypatch):
     monkeypatch.setenv("DPC_BACKEND", "torch")
     monkeypatch.setattr(module, "_fast", lambda *a: pytest.fail("the numba path ran"))
     run(layer(0), True, torch.ones(2, 20, 12))
+
+
+@pytest.mark.parametrize("features", [0, 5])
+def test_an_index_out_of_range_is_refused(features):
+    """The kernels would read, and in the gradient write, what isn't theirs."""
+    points, centers, idx, *rest = layer(features)
+    for wrong in (idx + 1, idx - 1):
+        with pytest.raises(ValueError, match=r"0\.\.49"):
+            run((points, centers, wrong, *rest), True, None)

@@ -246,7 +246,8 @@ def test_a_full_disk_is_explained_and_keeps_what_is_done(tmp_path, monkeypatch, 
 
     monkeypatch.setattr(CloudsWriter, "write", write)
     with pytest.raises(
-        DpcError, match=r"no space left on the device \(about .* needed, .* free in .*\); the 2 samples done are kept"
+        DpcError,
+        match=r"no space left on the device \(about .* needed, .* free in .*\); what is done, 2 samples, is kept",
     ) as error:
         convert(ToyReader(), tmp_path / "a.h5")
     assert error.value.exit_code == 1
@@ -343,9 +344,9 @@ def test_other_data_labels_or_classes_under_the_same_names_are_not_already_compl
         assert convert(CloudFolders(same, labels=table), output).was_complete
     for text in ("walk,1", "wave,7"):  # a class, a subject
         other.write_text(table.read_text().replace("wave,1", text))
-        with pytest.raises(UsageError, match="exists, made with items_digest"):
+        with pytest.raises(UsageError, match="exists, made with other samples, labels or sizes of files"):
             convert(CloudFolders(first, labels=other), output)
-    with pytest.raises(UsageError, match="exists, made with items_digest"):
+    with pytest.raises(UsageError, match="exists, made with other samples, labels or sizes of files"):
         convert(CloudFolders(longer, labels=table), output)
 
 

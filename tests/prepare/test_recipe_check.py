@@ -200,7 +200,7 @@ def panda(tmp_path) -> Path:
 def test_a_whole_animal_passes(panda):
     done = check("artemis", panda)
     assert done.exit_code == 0, done.stdout
-    assert "index: 1 samples to convert, 0 that cannot be" in done.stdout and "MISSING" not in done.stdout
+    assert "index: 1 sample to convert, 0 that cannot be" in done.stdout and "MISSING" not in done.stdout
     assert "optional voxels and their bones" in done.stdout
     for folder in (panda / "img/walk").iterdir():  # a copy of one camera only is whole in itself
         for path in folder.glob("img_0001*"):
@@ -213,10 +213,7 @@ def test_a_whole_animal_passes(panda):
     [
         (lambda raw: (raw / "CamPose.inf").unlink(), "CamPose.inf: missing"),
         (lambda raw: (raw / "Intrinsic.inf").write_text("0\n9 0 4\n0 9 4\n0 0 1\n"), "2 cameras, Intrinsic.inf 1"),
-        (
-            lambda raw: (raw / "img/walk/1/img_0001.jpg").unlink(),
-            "1 files are missing, the first: img/walk/1/img_0001.jpg",
-        ),
+        (lambda raw: (raw / "img/walk/1/img_0001.jpg").unlink(), "1 file missing, the first: img/walk/1/img_0001.jpg"),
         (lambda raw: (raw / "img/walk/2/img_0000_alpha.png").unlink(), "the first: img/walk/2/img_0000_alpha.png"),
         (lambda raw: (raw / "img/walk/0/img_0000.jpg").write_bytes(b""), "0 bytes, expected at least 1"),
         (lambda raw: (raw / "bones/walk/Bones_0001.inf").unlink(), "the first: bones/walk/Bones_0001.inf"),
@@ -283,7 +280,7 @@ def test_masks_and_views_of_a_clip_are_looked_for(clip):
     masks, views = clip.parent / "masks", clip.parent / "views"
     masks.mkdir()
     shutil.copy(clip / "0.png", masks)
-    assert "1 masks for 4 frames" in check("video", clip, "--mask", masks).stdout
+    assert "1 mask for 4 frames" in check("video", clip, "--mask", masks).stdout
     for frame in range(4):
         (views / f"{frame}_rgba").mkdir(parents=True)
         for view in range(6 - (frame == 3)):

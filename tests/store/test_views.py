@@ -106,8 +106,8 @@ def test_an_exception_leaves_no_file_and_an_existing_one_needs_force(tmp_path):
 @pytest.mark.parametrize(
     ("view", "frame", "rgba", "message"),
     [
-        (3, 0, picture(0, 0), "3 views, 4 frames"),
-        (0, 4, picture(0, 0), "3 views, 4 frames"),
+        (3, 0, picture(0, 0), "3 views and 4 frames"),
+        (0, 4, picture(0, 0), "3 views and 4 frames"),
         (-1, 0, picture(0, 0), "3 views"),
         (0, 0, picture(0, 0).astype(np.float32), "float32"),
         (0, 0, picture(0, 0)[..., :3], "expected uint8"),
@@ -207,7 +207,7 @@ def test_damaged_truth_and_pixels_are_found_when_read(tmp_path):
     with ViewsReader(path) as reader:
         with pytest.raises(DataError, match="view 0, frame 0: damaged"):
             reader.rgba(0, 0)
-        with pytest.raises(DataError, match="3 views, 4 frames"):
+        with pytest.raises(DataError, match="3 views and 4 frames"):
             reader.rgba(3, 0)
 
 

@@ -23,6 +23,7 @@ from dpcli.classify.explain.tsne import (
     video_features,
 )
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.counted import counted
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
@@ -72,7 +73,9 @@ class Embedding:
 
     def lines(self) -> list[str]:
         """Returns the same for a person, one line a stream below a heading."""
-        heading = f"{len(self.labels)} videos, perplexity {self.perplexity:.3g}; of the features, not of the map:"
+        heading = (
+            f"{counted(len(self.labels), 'video')}, perplexity {self.perplexity:.3g}; of the features, not of the map:"
+        )
         return [heading] + [
             f"{stream:<8} {embedding.features.shape[1]:>5} numbers, {_caption(embedding)}"
             for stream, embedding in self.streams.items()
@@ -150,7 +153,9 @@ def _tell_what_is_missing(labels: np.ndarray) -> None:
     """Says which figures there can't be, and why."""
     unknown, classes = int((labels < 0).sum()), len(np.unique(labels[labels >= 0]))
     if unknown:
-        log.info(f"{unknown} of {len(labels)} videos have no label: gray in the picture, left out of the figures")
+        log.info(
+            f"{unknown} of {counted(len(labels), 'video')} without a label: gray in the picture, left out of the figures"
+        )
     if classes < 2:
         log.info(
             f"{'one class' if classes else 'no labels'}: no neighbors' accuracy and no silhouette, which compare classes"

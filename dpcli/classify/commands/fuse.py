@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.classify.fusion import MEANS, geometric_weights, likelihood_weights, mean_scores, parse_weights
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
 from dpcli.runtime import provenance
@@ -89,7 +90,7 @@ def _judges(inputs: Sequence[str], output: str, weights: str | None, weights_fro
     judges = weights_from.split(",") if weights_from is not None else []
     if weights_from is not None and len(judges) != len(inputs):
         raise UsageError(
-            f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order"
+            f"--weights-from {weights_from}: {counted(len(judges), 'file')} for {len(inputs)}; one for each, in the same order"
         )
     if list(inputs).count("-") > 1:
         raise UsageError("-: stdin is one file; name the others")
@@ -216,7 +217,9 @@ def matching_rows(sources: Sequence[ScoresReader], called: Sequence[str]) -> lis
 
 def _same_classes(one: list[str], two: list[str], first: str, other: str) -> None:
     if len(one) != len(two):
-        raise DataError(f"{other}: {len(two)} classes, in {first} {len(one)}; fuse scores of the same classes")
+        raise DataError(
+            f"{other}: {counted(len(two), 'class')}, in {first} {len(one)}; fuse scores of the same classes"
+        )
     for index, (a, b) in enumerate(zip(one, two)):
         if a != b:
             raise DataError(f"{other}: class {index} is {b!r}, in {first} it is {a!r}; fuse scores of the same classes")

@@ -15,6 +15,7 @@ from dpcli.classify.data.videos import check_classes, report_backward, report_sh
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.video_scores import VideoScores, predict_videos
+from dpcli.counted import counted
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
 from dpcli.runtime.machines.once_per_process import OncePerProcess
@@ -100,7 +101,7 @@ def predict(
         made = ScoresReader(target)
     if made.rejected is not None:
         log.info(
-            f"nothing recognized in {int(made.rejected.sum())} of {len(made.names)} videos (`rejected` in the file)"
+            f"nothing recognized in {int(made.rejected.sum())} of {counted(len(made.names), 'video')} (`rejected` in the file)"
         )
     for line in skipped_lines(made.skipped):
         log.warn(line)

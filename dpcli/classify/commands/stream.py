@@ -20,6 +20,7 @@ from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames
 from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
+from dpcli.counted import counted
 from dpcli.errors import DataError, DpcError, Stopped
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -101,7 +102,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
             fused, *single = predictor.mean
             target.write(Path(task.source).stem, fused, streams=dict(zip(predictor.streams, single)))
     if task.output:
-        log.info(f"{task.output}: the stream's mean scores in {len(info.class_names)} classes")
+        log.info(f"{task.output}: the stream's mean scores in {counted(len(info.class_names), 'class')}")
     if problem is not None:
         raise problem
     return predictor.window.count
@@ -178,14 +179,14 @@ def _follow(
     finally:
         feed.close()
     if (made := predictor.finish()) is not None:
-        log.info(f"{predictor.window.count} frames are fewer than the window's {predictor.window.size}")
+        log.info(f"{counted(predictor.window.count, 'frame')}, fewer than the window's {predictor.window.size}")
         lines.write(made, time.monotonic() - arrived, feed.waiting)
     watch.sum_up()
     count = predictor.window.count
     if stop.requested and problem is None and stop.name == _CTRL_C:
         problem = KeyboardInterrupt()
     elif stop.requested and problem is None:
-        problem = Stopped(f"stopped by {stop.name} after {count} frames; what came before is predicted")
+        problem = Stopped(f"stopped by {stop.name} after {counted(count, 'frame')}; what came before is predicted")
     if predictor.clips:
         lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
     return problem

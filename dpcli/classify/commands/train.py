@@ -115,7 +115,7 @@ def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
     settings = training_settings(_with_preset(given, preset))
     if given.preset == AUTO and preset == "long":
         log.info(
-            f"preset long: the median video has {int(np.median(reader.frame_counts))} frames, four clips of"
+            f"preset long: the median video has {counted(int(np.median(reader.frame_counts)), 'frame')}, four clips of"
             f" {settings.network.num_frames} or more; clips of a video are judged together (--preset quick: each for itself)"
         )
     return replace(settings, schedule=resolved(settings.schedule, reader))
@@ -256,7 +256,7 @@ def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
         "data": videos.digest,
         "seed": seed,
         "validation": rule,
-        "trained_on": f"{videos.counts[0]} videos",
+        "trained_on": f"{counted(videos.counts[0], 'video')}",
         NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }
@@ -268,13 +268,14 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
     seen = {int(reader.labels[i]) for i in training}
     if len(seen) < 2:
         raise DataError(
-            f"{reader.path}: all {len(training)} training videos are of class {names[min(seen)]!r}; at least two classes are needed"
+            f"{reader.path}: {counted(len(training), 'training video')}, of class {names[min(seen)]!r} alone;"
+            " at least two classes are needed"
         )
     judged = {int(reader.labels[i]) for i in validation} | set(np.unique(reader.labels[reader.labels >= 0]).tolist())
     missing = [names[label] for label in sorted(judged - seen)]
     if missing:
         log.warn(
-            f"{len(missing)} of {len(names)} classes have no training video and can't be recognized: {', '.join(missing[:8])}"
+            f"{len(missing)} of {counted(len(names), 'class')} without a training video, so never recognized: {', '.join(missing[:8])}"
         )
 
 
@@ -285,7 +286,9 @@ def _tell_unlabeled(reader: CloudsReader) -> None:
     ]
     if names:
         shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
-        log.warn(f"{reader.path}: {len(names)} videos of the split 'train' have no label and are left out: {shown}")
+        log.warn(
+            f"{reader.path}: {counted(len(names), 'video')} of the split 'train' without a label, left out: {shown}"
+        )
 
 
 def check_shares(clips: int, schedule: Schedule, processes: int) -> None:
@@ -293,7 +296,7 @@ def check_shares(clips: int, schedule: Schedule, processes: int) -> None:
     mean of these is the whole batch's only where shares are equal."""
     if processes > 1 and clips < schedule.batch:
         raise UsageError(
-            f"batch = {schedule.batch}: an epoch has {clips} clips, which {processes} processes can't share evenly; take a"
+            f"batch = {schedule.batch}: an epoch has {counted(clips, 'clip')}, which {processes} processes can't share evenly; take a"
             " smaller batch, more clips_per_video or one process"
         )
 
@@ -316,7 +319,7 @@ def _new_model(settings: TrainingSettings, videos: _Videos, folder: RunFolder) -
             tell_unlike(str(videos.training.reader.path), looks, replace(info, config=config), name)
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
             log.warn(
-                f"{option} {name}: its static stream learned from neighbors up to {other.config.static_radius} frames away, here"
+                f"{option} {name}: its static stream learned from neighbors up to {counted(other.config.static_radius, 'frame')} away, here"
                 f" {config.static_radius}; --set static_temporal_radius={other.config.static_radius} keeps that"
             )
     return model
@@ -327,11 +330,9 @@ def _announce(device: torch.device, processes: Processes, videos: _Videos, setti
     threads = f"{device} ({counted(torch.get_num_threads(), 'thread')})"
     where = threads if device.type == "cpu" else torch.cuda.get_device_name(device)
     if processes.count > 1:
-        where = (
-            f"{processes.count} processes, each on {where}, {schedule.batch // processes.count} clips of a batch each"
-        )
+        where = f"{processes.count} processes, each on {where}, {counted(schedule.batch // processes.count, 'clip')} of a batch each"
     log.info(
-        f"training on {where}: {videos.counts[0]} videos, {videos.counts[1]} for validation ({settings.run.validation});"
+        f"training on {where}: {counted(videos.counts[0], 'video')}, {videos.counts[1]} for validation ({settings.run.validation});"
         f" epochs {schedule.epochs} + {schedule.epochs_dynamic}"
         + (f"; of {settings.run.init} learns: {schedule.fine_tune}" if settings.run.init else "")
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.classify.network.model_file import SHIPPED, ModelInfo, find_model
+from dpcli.counted import counted
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
@@ -72,7 +73,7 @@ def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
     long = [i for i in sequences if longest and reader.frame_counts[i] > _SEVERAL * longest]
     if long:
         log.warn(
-            f"{reader.path}: {len(long)} of {len(sequences)} videos are over {_SEVERAL:g} times as long as any that {model} learned"
+            f"{reader.path}: {len(long)} of {counted(len(sequences), 'video')} over {_SEVERAL:g} times as long as any that {model} learned"
             f" from ({reader.names[long[0]]}: {reader.frame_counts[long[0]]} frames after {longest:g}), and each gets one label:"
             " --segments cuts recordings of several actions"
         )

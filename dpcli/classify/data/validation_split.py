@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.classify.network.config import CROSS
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
@@ -126,7 +127,9 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
             f"--validation {rule}: expected fold:I/N with I = 0 ... N-1 and N at least 2, such as fold:3/10"
         )
     if count > len(chosen):
-        raise UsageError(f"--validation {rule}: {count} folds of {len(chosen)} training videos; ask for fewer folds")
+        raise UsageError(
+            f"--validation {rule}: {count} folds of {counted(len(chosen), 'training video')}; ask for fewer folds"
+        )
     of = folds(reader.labels[chosen], reader.subjects[chosen], count, seed)
     return [i for i, k in zip(chosen, of) if k != which], [i for i, k in zip(chosen, of) if k == which]
 

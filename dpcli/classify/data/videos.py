@@ -8,6 +8,7 @@ from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.model_file import ModelInfo
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
@@ -27,7 +28,7 @@ def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name:
     if not chosen:
         raise DataError(f"{reader.path}: no sample of split {wanted!r}; it has {sorted(set(reader.splits))}")
     if split == "auto":
-        log.info(f"scoring split {wanted!r}: {len(chosen)} of {len(reader)} videos (--split chooses)")
+        log.info(f"scoring split {wanted!r}: {len(chosen)} of {counted(len(reader), 'video')} (--split chooses)")
         _tell_trained(reader, chosen, model_name)
     return chosen
 
@@ -82,16 +83,16 @@ def report_backward(reader: CloudsReader, sequences: list[int]) -> None:
     names = [reader.names[i] for i, time in times if time is not None and not (np.diff(time) >= 0).all()]
     if names:
         log.warn(
-            f"{reader.path}: time runs back in {len(names)} of {len(sequences)} videos: {first_names(names)}"
+            f"{reader.path}: time runs back in {len(names)} of {counted(len(sequences), 'video')}: {first_names(names)}"
             "; frames are taken in the file's order (is a recording cut wrongly?)"
         )
 
 
 def report_short(source: ClipSource, frames: int) -> None:
     """Names the videos that are dropped or padded, and those with frames without points, with a message each."""
-    for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
+    for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding the last frame")):
         if names:
-            log.info(f"{len(names)} videos shorter than {frames} frames are {what}: {first_names(names)}")
+            log.info(f"{counted(len(names), 'video')} of fewer than {frames} frames, {what}: {first_names(names)}")
     if source.timing != "slots":
         _report_empty(source)
 
@@ -105,6 +106,6 @@ def _report_empty(source: ClipSource) -> None:
     found = {i: int(counts[i]) for i in source.sequences if counts[i]}
     if found:
         log.warn(
-            f"{reader.path}: {sum(found.values())} frames without points in {len(found)} videos are taken as points at the origin:"
-            f" {first_names([reader.names[i] for i in found])}"
+            f"{reader.path}: {counted(sum(found.values()), 'frame')} without points in {counted(len(found), 'video')}"
+            f" taken as points at the origin: {first_names([reader.names[i] for i in found])}"
         )

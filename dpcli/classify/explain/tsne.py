@@ -13,6 +13,7 @@ from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.explain.features import ClipVectors
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.video_scores import batches
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.progress import Progress
 from dpcli.runtime.seeds import scikit_learn_state
@@ -64,7 +65,7 @@ def chosen_perplexity(wanted: float | None, videos: int) -> float:
     """
     if videos < _FEWEST:
         raise DataError(
-            f"{videos} videos are too few for a map, expected at least {_FEWEST}; take another --split, or all"
+            f"{counted(videos, 'video')} for a map, expected at least {_FEWEST}; take another --split, or all"
         )
     if wanted is None:
         return min(_PERPLEXITY, (videos - 1) / 3)

@@ -152,10 +152,9 @@ class _Case:
     """Holds a call's inputs and sizes, and what is made of the inputs on the way to the planes."""
 
     def __init__(self, tensors: tuple[Tensor | None, ...], neighbors: int, layout: _Layout, fit: Fit) -> None:
-        from dpcli.ops.cpu import small_inverses as kernels_linalg
-        from dpcli.ops.cpu import surface_fit as kernels_surface
+        from dpcli.ops.cpu import small_inverses, surface_fit
 
-        self.row_kernels, self.solve_kernels = kernels_surface, kernels_linalg
+        self.row_kernels, self.solve_kernels = surface_fit, small_inverses
         self.neighbors, self.layout = neighbors, layout
         self.rule = (layout.places, layout.groups, *solve_rule(fit.solver, fit.guard))
         self.activation, weight, bias, near, times, logits = tensors

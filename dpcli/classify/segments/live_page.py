@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut
 from dpcli.classify.stream.sliding_window import Prediction
+from dpcli.counted import counted
 from dpcli.draw.page.assemble import write_page
 from dpcli.draw.page.live import LiveTrack, live_page
 from dpcli.draw.page.points import PageFacts, PageSequence
@@ -67,7 +68,10 @@ class LivePage:
         segments = cut(WindowScores(last, scores, frames), self.class_names, how)
         track = LiveTrack(last, confidence.of(scores), latency, segments, confidence.threshold)
         facts = PageFacts(
-            self.title, f"{frames} frames, {clips} predictions; {end}", self._notes(), self._rows(latency)
+            self.title,
+            f"{counted(frames, 'frame')}, {counted(clips, 'prediction')}; {end}",
+            self._notes(),
+            self._rows(latency),
         )
         facts.history.append({"command": self.command})
         write_page(live_page(facts, sequence, track, self.class_names), self.path)
@@ -79,7 +83,7 @@ class LivePage:
     def _rows(self, latency: np.ndarray) -> list[tuple[str, str]]:
         own = self.how.confidence
         return [
-            ("window", f"{self.how.window} frames"),
+            ("window", counted(self.how.window, "frame")),
             ("temperature", f"{own.temperature:g}"),
             ("nothing below", f"{own.threshold:g}" if own.threshold else "never"),
             ("latency", f"{latency.mean():.0f} ms on average, at most {latency.max():.0f}"),

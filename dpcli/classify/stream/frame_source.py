@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.progress import log
 from dpcli.store.pipes import standard_input
@@ -158,7 +159,7 @@ def as_frame(points: np.ndarray, where: str) -> np.ndarray:
         frame = np.array(points, np.float32, order="C")
     bad = int((~np.isfinite(frame[:, :3])).any(1).sum())
     if bad:
-        raise DataError(f"{where}: {bad} of {len(frame)} points are NaN or infinite; drop them before sending")
+        raise DataError(f"{where}: {bad} of {counted(len(frame), 'point')} NaN or infinite; drop them before sending")
     return frame
 
 

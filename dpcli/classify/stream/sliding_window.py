@@ -14,6 +14,7 @@ from dpcli.classify.data.clips import Clip, ClipSource, clip_frames, uniform_fra
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.video_scores import clip_scores
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence
@@ -74,16 +75,18 @@ def window_size(info: ModelInfo, window: int | None) -> int:
     needed = info.config.num_frames
     if info.timing == "clips":
         if window not in (None, needed):
-            raise UsageError(f"--window {window}: this model takes {needed} consecutive frames; leave the option out")
+            raise UsageError(
+                f"--window {window}: this model takes {counted(needed, 'consecutive frame')}; leave the option out"
+            )
         return needed
     if window is None:
         raise UsageError(
-            f"this model looks at whole videos in {needed} parts, and a stream has no end: give the number of frames to look back,"
-            " about as many as an action lasts, such as --window 40"
+            f"this model looks at whole videos in {counted(needed, 'part')}, and a stream has no end: give the number of frames"
+            " to look back, about as many as an action lasts, such as --window 40"
         )
     least = 1 if info.timing == "slots" else needed
     if window < least:
-        raise UsageError(f"--window {window}: the model takes {needed} frames; expected at least {least}")
+        raise UsageError(f"--window {window}: the model takes {counted(needed, 'frame')}; expected at least {least}")
     return window
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.options import Force, Json, Seed
+from dpcli.counted import counted
 
 
 def baseline(
@@ -28,7 +29,7 @@ def baseline(
         typer.echo(json.dumps({**asdict(result), "accuracy": result.accuracy}), err=output == "-")
         return
     typer.echo(
-        f"forest: {100 * result.accuracy:.1f} % ({result.right} of {result.judged} videos, {result.classes} classes;"
+        f"forest: {100 * result.accuracy:.1f} % ({result.right} of {counted(result.judged, 'video')}, {counted(result.classes, 'class')};"
         f" learned from {result.learned}); these are {result.seen}",
         err=output == "-",
     )

@@ -12,6 +12,7 @@ from dpcli.classify.explain.pac_settings import PAC
 from dpcli.cli.classify.options import Data, Model, Split, Stream
 from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.cli.settings_options import options_of
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 
@@ -51,7 +52,9 @@ def pac(
     task = ModelTask(data, model, output, backbone, split, seed, device, force)
     done = explain_pac(task, PacRequest(samples, stream, settings, picture, animation))
     if output != "-":
-        typer.echo(f"{output}: activations of {done.points:,} points in {done.clips} clips of {done.frames} frames")
+        typer.echo(
+            f"{output}: activations of {done.points:,} points in {counted(done.clips, 'clip')} of {counted(done.frames, 'frame')}"
+        )
 
 
 def tsne(

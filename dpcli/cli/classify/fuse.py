@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.options import Force, Output
+from dpcli.counted import counted
 
 
 def fuse(
@@ -47,4 +48,4 @@ def fuse(
         shares = ", ".join(f"{name} {weight:.3g}" for name, weight in result.weights.items())
         kind = "mean" if mean == "arithmetic" else f"{mean} mean"
         unequal = f", weights {shares}" if len(set(result.weights.values())) > 1 else ""
-        typer.echo(f"{output}: {kind} of {len(result.weights)} scores of {result.videos} videos{unequal}")
+        typer.echo(f"{output}: {kind} of {len(result.weights)} scores of {counted(result.videos, 'video')}{unequal}")

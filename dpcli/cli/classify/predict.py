@@ -74,4 +74,4 @@ def predict(
     if result.complete:
         typer.echo(f"{output}: complete")
     elif output != "-":
-        typer.echo(f"{output}: scores of {counted(result.videos, 'video')} in {result.classes} classes")
+        typer.echo(f"{output}: scores of {counted(result.videos, 'video')} in {counted(result.classes, 'class')}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+from dpcli.counted import counted
 from dpcli.standard_streams import printable
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Lines:
             }
             print(json.dumps(row), flush=True)
             return
-        behind = f", {waiting} frame{'' if waiting == 1 else 's'} waiting" if waiting else ""
+        behind = f", {counted(waiting, 'frame')} waiting" if waiting else ""
         said = f"{NOTHING}; best " if nothing else ""
         print(
             f"frame {made.frame}: {said}{self._text(self.confidence.of(made.scores))}; {latency:.0f} ms{behind}",
@@ -71,9 +72,8 @@ class Lines:
             }
             print(json.dumps(row), flush=True)
             return
-        plural = "" if clips == 1 else "s"
         print(
-            f"{end}: {frames} frames, {clips} clip{plural}: mean {self._text(mean)}; "
+            f"{end}: {counted(frames, 'frame')}, {counted(clips, 'clip')}: mean {self._text(mean)}; "
             f"latency {average:.0f} ms on average, at most {highest:.0f}",
             flush=True,
         )

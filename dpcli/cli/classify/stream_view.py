@@ -8,6 +8,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from dpcli.cli.classify.stream_lines import NOTHING, Lines
+from dpcli.counted import counted
 from dpcli.standard_streams import printable, rich_console
 
 if TYPE_CHECKING:
@@ -64,7 +65,9 @@ class View:
         silent = time.monotonic() - self.last_seen
         told = f"frame {self.frames - 1}" + (f", waiting for frames since {silent:.0f} s" if silent > _QUIET else "")
         if self.newest is None:
-            return Panel(Text(f"the window of {self.speaker.window} frames is not full yet"), title=told, width=72)
+            return Panel(
+                Text(f"the window of {counted(self.speaker.window, 'frame')} is not full yet"), title=told, width=72
+            )
         probabilities, latency, waiting = self.newest
         behind = f", {waiting} frame{'' if waiting == 1 else 's'} waiting" if waiting else ""
         foot = Text(f"latency {1000 * latency:.0f} ms{behind}", style="dim")

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.options import Force
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 
 _FORMS = {".html": "html", ".htm": "html", ".md": "markdown", ".tex": "latex"}
@@ -65,7 +66,7 @@ def report(
         typer.echo(made.text, nl=False)
     else:
         write_whole(Path(output), made.text.encode("utf-8"))
-        log.info(f"wrote {output}: {made.results} results, {len(made.text.encode()) / 1e6:.2f} MB")
+        log.info(f"wrote {output}: {counted(made.results, 'result')}, {len(made.text.encode()) / 1e6:.2f} MB")
 
 
 def _form(output: str | None, as_markdown: bool, as_latex: bool) -> str:

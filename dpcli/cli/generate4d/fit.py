@@ -65,4 +65,4 @@ def _fit_many(views: list[str], folder: Path, *settings: Any, **options: Any) ->
     typer.echo(f"{folder}: {counted(len(fitted.scenes), 'scene')}")
     if fitted.failed:
         named = "; ".join(f"{views}: {reason}" for views, reason in fitted.failed[:5])
-        raise DataError(f"{len(fitted.failed)} clips have no scene: {named}")
+        raise DataError(f"no scene of {counted(len(fitted.failed), 'clip')}: {named}")

@@ -9,6 +9,7 @@ import typer
 
 from dpcli.cli.options import Device, Json
 from dpcli.cli.settings_options import options_of
+from dpcli.counted import counted
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.segment.network.config import NETWORK_PRESETS, NetworkSettings
 
@@ -40,7 +41,7 @@ def render_cost(cost: dict[str, Any]) -> str:
             f"multiply-adds {counts['total'] / 1e9:.3f} G per frame (M: {shares})",
             f"  not counted: {cost['uncounted']}",
             f"latency       {cost['latency_ms']['four_frames']} ms for four frames on {cost['device']}"
-            f" with {cost['threads']} threads",
+            f" with {counted(cost['threads'], 'thread')}",
             f"peak memory   {cost['peak_memory_mb']} MB of the process",
         ]
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
 from dpcli.evaluate.classification.calibration import Calibration, are_probabilities, calibrate, calibration_weighted
@@ -140,7 +141,7 @@ def _choose_samples(scores: ScoresReader, found: TruthLabels, split: str) -> tup
     keep = of_split & labeled
     if not keep.any():
         count = int(of_split.sum())
-        raise DataError(f"{scores.path}: none of {count} samples has a label; give the truth with --truth FILE")
+        raise DataError(f"{scores.path}: {counted(count, 'sample')} without a label; give the truth with --truth FILE")
     left_out = [
         *found.left_out,
         LeftOut(f"not of split {split!r}", _names(scores, found.in_truth & ~of_split)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dpcli.counted import counted
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
@@ -24,13 +25,13 @@ def classification_tables(report: ClassificationReport) -> list[TextTable]:
 def classification_notes(report: ClassificationReport) -> list[str]:
     """Returns sentences on what was counted, and what was left out."""
     occur = f"{int((report.main.support > 0).sum())} of {len(report.class_names)} classes occur"
-    lines = [f"{report.main.samples} samples of split {report.split!r}, {occur}; truth: {report.truth}."]
+    lines = [f"{counted(report.main.samples, 'sample')} of split {report.split!r}, {occur}; truth: {report.truth}."]
     lines += resampling_note(report.resampling, "samples", report.main.samples)
     lines.append(_calibration_note(report))
     if report.accepted is not None:
         kept, right = report.accepted
         lines.append(
-            f"Nothing was recognized in {report.main.samples - kept} samples (the tables count them as scored); of the other"
+            f"Nothing was recognized in {counted(report.main.samples - kept, 'sample')} (the tables count them as scored); of the other"
             f" {kept} {right} are right ({percent(float(divide(right, kept)))})."
         )
     for entry in report.left_out:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.results import LeftOut, counted_split, list_names
 from dpcli.store import CloudsReader, ScoresReader
@@ -83,7 +84,9 @@ def _check_classes(scores: ScoresReader, truth: str | Path, class_names: Sequenc
     if not class_names or list(class_names) == list(scores.class_names):
         return
     if len(class_names) != len(scores.class_names):
-        raise DataError(f"{truth}: {len(class_names)} classes, but {scores.path} scores {len(scores.class_names)}")
+        raise DataError(
+            f"{truth}: {counted(len(class_names), 'class')}, but {scores.path} scores {len(scores.class_names)}"
+        )
     pairs = enumerate(zip(class_names, scores.class_names, strict=True))
     label, (ours, theirs) = next(pair for pair in pairs if pair[1][0] != pair[1][1])
     raise DataError(f"{truth}: class {label} is {ours!r}, in {scores.path} it is {theirs!r}")

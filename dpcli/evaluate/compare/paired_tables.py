@@ -71,6 +71,6 @@ def compare_notes(report: CompareReport) -> list[str]:
             lines.append(
                 f"Right in A only: {own.only_a}, in B only: {own.only_b}; McNemar's exact test: p {p_value_text(own.p)}."
             )
-        notes = [left_out_note(entry, part.kind) for entry in part.left_out]
+        notes = [left_out_note(entry, part.kind.removesuffix("s")) for entry in part.left_out]
         lines += [note for note in notes if note not in lines]  # segmentation and motion leave out the same
     return lines

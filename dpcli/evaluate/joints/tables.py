@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.evaluate.joints.metrics import JointStatistics
 from dpcli.evaluate.joints.protocol import METRICS, JointReport
 from dpcli.evaluate.joints.visibility import VISIBLE
@@ -71,14 +72,14 @@ def joint_notes(report: JointReport) -> list[str]:
     """Returns sentences on what was counted and how, and what was left out."""
     total = report.total
     return [
-        f"Split {report.split!r}, truth: {report.truth}. {total.joints} true joints of {len(report.names)} sequences, "
-        f"{total.predicted} predicted, {total.edges} between the right parts.",
+        f"Split {report.split!r}, truth: {report.truth}. {counted(total.joints, 'true joint')} of "
+        f"{counted(len(report.names), 'sequence')}, {total.predicted} predicted, {total.edges} between the right parts.",
         f"{total.visible} true joints move visibly."
         if report.poses
         else "Which joints move visibly is unknown: the truth has no poses.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         _NOTE,
-        *(left_out_note(entry, "sequences") for entry in report.left_out),
+        *(left_out_note(entry, "sequence") for entry in report.left_out),
     ]
 
 

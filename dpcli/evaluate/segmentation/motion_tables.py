@@ -6,6 +6,7 @@ from itertools import starmap
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, SHARES, TAUS, MotionMetrics, flow_keys
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
@@ -69,7 +70,7 @@ def motion_notes(report: MotionReport) -> list[str]:
         else "over all points"
     )
     lines = [
-        f"Split {report.split!r}, truth: {report.truth}. {main.pairs} frame pairs of {report.sequences} sequences; "
+        f"Split {report.split!r}, truth: {report.truth}. {counted(main.pairs, 'frame pair')} of {counted(report.sequences, 'sequence')}; "
         f"means {how}. no motion: EPE3D of predicting none.",
         "At tau: AccS error < tau or 5 %, AccR < 2 tau or 10 %, Outlier > 6 tau or 10 % of the true flow. The published "
         "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05.",
@@ -80,4 +81,4 @@ def motion_notes(report: MotionReport) -> list[str]:
         lines.append(f"Left out, frame pairs other than f -> f + 1: {report.without_truth}.")
     if main.unknown:
         lines.append(f"Left out, points without a true part (-1): {main.unknown} over all pairs.")
-    return [*lines, *(left_out_note(entry, "sequences") for entry in report.left_out)]
+    return [*lines, *(left_out_note(entry, "sequence") for entry in report.left_out)]

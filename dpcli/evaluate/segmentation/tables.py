@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
@@ -50,8 +51,9 @@ def segmentation_notes(report: SegmentationReport) -> list[str]:
     main = report.main
     lines = [
         f"Split {report.split!r}, truth: {report.truth}. AP, PQ, F1, precision, recall: {main.true_positives} found of "
-        f"{main.truth_parts} true parts, {main.predictions} predictions, pooled over {main.frames} frames; "
-        f"mIoU, Rand index: mean over the frames of each of {main.objects} sequences, then over these.",
+        f"{counted(main.truth_parts, 'true part')}, {counted(main.predictions, 'prediction')}, pooled over "
+        f"{counted(main.frames, 'frame')}; mIoU, Rand index: mean over the frames of "
+        f"each of {counted(main.objects, 'sequence')}, then over these.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         *_protocol_notes(report.protocol),
     ]
@@ -64,7 +66,7 @@ def segmentation_notes(report: SegmentationReport) -> list[str]:
     ):
         if count:
             lines.append(f"Left out, {what}: {count}.")
-    return [*lines, *(left_out_note(entry, "sequences") for entry in report.left_out)]
+    return [*lines, *(left_out_note(entry, "sequence") for entry in report.left_out)]
 
 
 def _protocol_notes(protocol: str) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import LeftOut, counted_split, list_names, tell_split
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
@@ -118,11 +119,11 @@ class PairedSequences:
         where = f"{self.predicted.path}: {truth.name!r} has"
         again = f"in {self.truth.path}; predict again from that file"
         if truth.num_frames != predicted.num_frames:
-            raise DataError(f"{where} {predicted.num_frames} frames, {truth.num_frames} {again}")
+            raise DataError(f"{where} {counted(predicted.num_frames, 'frame')}, {truth.num_frames} {again}")
         sizes, others = np.diff(predicted.frame_offsets), np.diff(truth.frame_offsets)
         if (sizes != others).any():
             frame = int((sizes != others).argmax())
-            raise DataError(f"{where} {sizes[frame]} points in frame {frame}, {others[frame]} {again}")
+            raise DataError(f"{where} {counted(sizes[frame], 'point')} in frame {frame}, {others[frame]} {again}")
         differ = (truth.points != predicted.points).any(axis=1)
         if differ.any():
             row = int(differ.argmax())

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.results import (
@@ -95,12 +96,13 @@ def _row(one: RecordingCounts) -> list[str]:
 def segments_notes(report: SegmentsReport) -> list[str]:
     """Returns sentences on what was counted and how, and what was left out."""
     true, said = (sum(getattr(one, key) for one in report.counts) for key in ("true", "predicted"))
+    frames = sum(one.frames for one in report.counts)
     return [
-        f"{len(report.names)} recordings, {sum(one.frames for one in report.counts)} frames, {true} true segments and {said} "
+        f"{counted(len(report.names), 'recording')}, {counted(frames, 'frame')}, {counted(true, 'true segment')} and {said} "
         f"predicted ones; truth: {report.truth}.",
         *resampling_note(report.resampling, "recordings", len(report.names)),
         _NOTE,
-        *(left_out_note(entry, "recordings") for entry in report.left_out),
+        *(left_out_note(entry, "recording") for entry in report.left_out),
     ]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.results import LeftOut, merge_statistics
 from dpcli.evaluate.video.learned.base import LearnedMetric
@@ -98,7 +99,7 @@ class FramePass:
     def _refuse_damaged(self, damaged: list[str]) -> None:
         if damaged and not self.intersect:
             raise DataError(
-                f"{self.predicted.path}: {len(damaged)} frames with NaN or infinite pixels, the first "
+                f"{self.predicted.path}: {counted(len(damaged), 'frame')} with NaN or infinite pixels, the first "
                 f"{damaged[0]}; make them again, or leave them out with --intersect"
             )
         if damaged:
@@ -151,12 +152,12 @@ class FramePass:
             self._check_size(predicted, truth, f"view {view.title!r}, frame {frame}")
             if truth.unusable:
                 raise DataError(
-                    f"{self.truth.path}: view {view.title!r}, frame {frame}: {truth.unusable} pixels are NaN "
-                    "or infinite; make the truth again"
+                    f"{self.truth.path}: view {view.title!r}, frame {frame}: {counted(truth.unusable, 'pixel')} "
+                    "that are NaN or infinite; make the truth again"
                 )
             watch(view, frame, count, predicted, truth)
             if predicted.unusable:
-                damaged.append(f"view {view.title} frame {frame} ({predicted.unusable} pixels)")
+                damaged.append(f"view {view.title} frame {frame} ({counted(predicted.unusable, 'pixel')})")
             else:
                 yield frame, predicted, truth
 

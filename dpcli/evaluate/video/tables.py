@@ -171,11 +171,15 @@ def video_notes(report: VideoReport) -> list[str]:
 
 def _surface_note(score: SurfaceScore) -> str:
     reach = " and ".join(f"{100 * share:g} %" for share in SHARES)
-    unseen = f" {score.unseen} frames in which the scene shows nothing: F-score 0, no distance." if score.unseen else ""
+    unseen = (
+        f" {counted(score.unseen, 'frame')} in which the scene shows nothing: F-score 0, no distance."
+        if score.unseen
+        else ""
+    )
     return (
         f"Surface: what {CAMERAS} cameras around see of the scene (alpha of one half or more), at most {MOST_POINTS} points "
         f"a frame, against {score.points} true points; F-score within {reach} of the diameter {four_digits(score.diameter)}; "
-        f"mean over {len(score.chamfer)} frames, which the intervals resample.{unseen}"
+        f"mean over {counted(len(score.chamfer), 'frame')}, which the intervals resample.{unseen}"
     )
 
 
@@ -195,7 +199,7 @@ def _picture_notes(report: VideoReport) -> list[str]:
     if "psnr_foreground" in report.names:
         lines.append(f"A wide {choices['background']} background raises PSNR and SSIM, but not PSNR on object.")
     if exact:
-        lines.append(f"{exact} frames are equal and count as {PSNR_CAP:g} dB.")
+        lines.append(f"{counted(exact, 'frame')} equal to the truth, counted as {PSNR_CAP:g} dB.")
     if empty and "psnr_foreground" in report.names:
-        lines.append(f"{empty} frames without an object in the truth: left out of PSNR on object.")
+        lines.append(f"{counted(empty, 'frame')} without an object in the truth: left out of PSNR on object.")
     return lines

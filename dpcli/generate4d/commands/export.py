@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.export import (
     as_sequence,
@@ -73,7 +74,7 @@ def _export_clouds(
             length_unit=str(root["length_unit"]),
             force=force,
         )
-    log.info(f"{sequence.num_frames} frames of {len(sequence.frame(0))} points")
+    log.info(f"{counted(sequence.num_frames, 'frame')} of {counted(len(sequence.frame(0)), 'point')}")
 
 
 def _is_single(form: Format, output: Path) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.generate4d.commands.fit import fit_scene
 from dpcli.generate4d.config import FitConfig, Supervision
@@ -76,8 +77,8 @@ def fit_clips(
                 raise result
             else:
                 fitted.scenes.append(scene)
-            log.info(f"{len(fitted.scenes)} of {len(mine)} clips are fitted")
-            stop.check(f"{len(fitted.scenes)} of {len(mine)} clips are fitted")
+            log.info(f"fitted: {len(fitted.scenes)} of {counted(len(mine), 'clip')}")
+            stop.check(f"fitted: {len(fitted.scenes)} of {counted(len(mine), 'clip')}")
     return fitted
 
 

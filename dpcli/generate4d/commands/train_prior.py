@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.generate4d.shape.model_file import load_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
@@ -58,7 +59,9 @@ def train_shape_prior(
         folder.write_settings(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
         kept = draw_round(held(HELD_OUT_ROUND, settings.data.validation))
         weights = sum(value.numel() for value in model.parameters())
-        log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")
+        log.info(
+            f"{weights:,} weights; {counted(len(kept.rgba), 'picture')} for validation; {counted(settings.schedule.steps, 'step')}"
+        )
         batch = kept.take(np.arange(len(kept.rgba)))
         with stop_requested() as stop:  # until here there is nothing to be kept, and a signal ends it at once
             trainer = ShapeTrainer(

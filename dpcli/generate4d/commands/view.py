@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.export import keep_opaque
 from dpcli.generate4d.viewer import write_page
@@ -34,4 +35,6 @@ def view_scene(
         scene, (root, history) = read_scene(place), scene_origin(place)
     scene = keep_opaque(scene, min_opacity)
     size = write_page(scene, output, title=title or str(root["source"]) or "scene", history=history, fps=fps, clip=clip)
-    log.info(f"{output}: {scene.num_gaussians} Gaussians, {scene.num_frames} frames, {size / 2**20:.1f} MiB")
+    log.info(
+        f"{output}: {counted(scene.num_gaussians, 'Gaussian')}, {counted(scene.num_frames, 'frame')}, {size / 2**20:.1f} MiB"
+    )

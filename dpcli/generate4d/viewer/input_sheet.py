@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsReader
@@ -28,7 +29,7 @@ def input_sheet(clip: Path, scene: GaussianScene) -> dict[str, Any]:
     with ViewsReader(clip) as reader:
         if reader.num_frames != scene.num_frames:
             raise DataError(
-                f"{clip}: {reader.num_frames} frames, but the scene has {scene.num_frames}; name the clip it was fitted to"
+                f"{clip}: {counted(reader.num_frames, 'frame')}, but the scene has {scene.num_frames}; name the clip it was fitted to"
             )
         scale = min(1.0, _SIDE / max(reader.header.size))
         width, height = (max(1, round(side * scale)) for side in reader.header.size)

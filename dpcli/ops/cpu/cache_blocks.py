@@ -12,7 +12,8 @@ from dpcli.runtime.tuning import torch_threads
 
 Task, Room = TypeVar("Task"), TypeVar("Room")
 
-# Of a sum, each with a target of its own: more than threads, and fixed, so that sums repeat exactly on any number of them.
+# Pieces of a sum, each added up in an array of its own: more than there are threads, and always as many, so that sums
+# repeat exactly on any number of threads.
 TASKS = 8
 
 
@@ -29,10 +30,10 @@ def steps(low: int, high: int, step: int) -> list[tuple[int, int]]:
 
 
 def share_tasks(tasks: Sequence[Task], make_room: Callable[[], Room], work: Callable[[int, Task, Room], None]) -> None:
-    """Calls work(number, task, room) for every task; `room` is the workspace that `make_room` gave the thread that does it.
+    """Calls work(number, task, room) for every task; `make_room` makes each thread a workspace, `room`, that it uses again.
 
-    There are as many threads as torch has, and the matrix products of each run on one thread: threads that shared each product
-    would wait for each other several times a task, and longer than they work. No gradients are recorded.
+    There are as many threads as torch has, and each computes its matrix products alone: threads that shared a product would
+    wait for one another several times a task, and longer than they work. No gradients are recorded.
     """
     threads, inference = torch.get_num_threads(), torch.is_inference_mode_enabled()
     waiting = iter(enumerate(tasks))

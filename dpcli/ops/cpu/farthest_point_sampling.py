@@ -2,9 +2,8 @@
 
 Points are sorted along a Morton curve and cut into buckets of 32 with bounding boxes, buckets into groups likewise. A new
 sample can only change a bucket whose box is nearer than the bucket's largest remaining distance, so most buckets, and
-most groups, are skipped. The skip is exact:
-float32 rounding is monotone, so the distance to a box, computed in the order of a point distance, never exceeds that of
-a point inside.
+most groups, are skipped. That is exact: float32 rounding is monotone, so the distance to a box, computed by the same
+operations as that to a point, never exceeds the distance to a point inside.
 """
 
 from __future__ import annotations

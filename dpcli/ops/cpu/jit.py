@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numba
+from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.sigutils import normalize_signature
 
+from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import load_numba_without_blas
 
 load_numba_without_blas()
 
 _FOLDER = Path(__file__).parent
-_SHARED = (Path(__file__), _FOLDER / "simd.py", _FOLDER.parent / "splatting" / "cpu_simd.py")
-# A digest of what is compiled into kernels of other files: an edit there makes their cached code stale.
+_SPLATTING = _FOLDER.parent / "splatting"
+_SHARED = (Path(__file__), _FOLDER / "simd.py", _SPLATTING / "cpu_simd.py", _SPLATTING / "cpu_tile_lists.py")
+# A digest of what is compiled into kernels of other files, functions and constants: an edit there makes their cached code stale.
 SHARED_CODE = hashlib.sha256(b"".join(path.read_bytes() for path in _SHARED)).hexdigest()
 
 # No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorize. Nothing that changes
@@ -22,13 +30,85 @@ SHARED_CODE = hashlib.sha256(b"".join(path.read_bytes() for path in _SHARED)).he
 _FLAGS = {"nnan", "nsz"}
 _ARITHMETIC = {"contract", "nsz", "arcp", "reassoc"}
 
+_PATIENCE = 1.5  # seconds of compiling before a user is told
+
+
+class _Announcement(event.Listener):
+    """Tells the user, once and only when it takes long, that the process compiles kernels instead of working."""
+
+    def __init__(self) -> None:
+        self.kept = True  # until a kernel finds no place on disk
+        self._said, self._depth, self._since, self._spent = False, 0, 0.0, 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        """Hears that a kernel, or a helper of the one in work, is compiled; numba's lock lets in one thread at a time."""
+        now = time.monotonic()
+        if self._depth == 0:
+            self._since = now
+        self._depth += 1
+        if not self._said and self._spent + now - self._since >= _PATIENCE:
+            self._said = True
+            self._say()
+
+    def on_end(self, event: event.Event) -> None:
+        """Hears that one is done."""
+        self._depth -= 1
+        if self._depth == 0:
+            self._spent += time.monotonic() - self._since
+
+    def _say(self) -> None:
+        worker = multiprocessing.parent_process() is not None
+        if worker and not multiprocessing.current_process().name.endswith("-1"):
+            return  # all workers compile the same at the same time; the first speaks for them
+        if self.kept:
+            log.info("compiling fast code for this machine, once; this may take half a minute")
+        else:
+            log.info(
+                "compiling fast code, which may take half a minute, in every run, because no folder could keep it;"
+                " NUMBA_CACHE_DIR=FOLDER names one that can"
+            )
+
+
+_announcement = _Announcement()
+event.register("numba:compile", _announcement)
+
+
+class _KernelCache(FunctionCache):
+    """Keeps compiled kernels on disk. A full disk, a damaged file or one of another user costs time, never the command."""
+
+    def __init__(self, function: Callable) -> None:
+        super().__init__(function)
+        file = self._cache_file
+        file._source_stamp = (file._source_stamp, SHARED_CODE)  # numba's own stamp is of the kernel's file alone
+
+    def load_overload(self, sig: object, target_context: object) -> object:
+        """Returns the compiled kernel, or None where there is none, it can't be read, or it is one for other types.
+
+        Processes that compile one kernel for different types at the same time may each give its file the same name.
+        """
+        try:
+            found = super().load_overload(sig, target_context)
+        except Exception:  # a pickle's bytes decide what is raised
+            return None
+        return found if found is None or found.signature.args == normalize_signature(sig)[0] else None
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Writes the compiled kernel; a second time over an index that can't be read; or not at all."""
+        for _ in range(2):
+            try:
+                return super().save_overload(sig, data)
+            except Exception:
+                with suppress(Exception):
+                    self.flush()
+        _announcement.kept = False
+
 
 def kernel(function: Callable) -> Callable:
     """Compiles a search, whose indices and distances must equal the reference's, on its first call.
 
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
     mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
-    in the file of the kernel that calls them: the cache looks for changes in that file and in the lanes' files only.
+    in the file of the kernel that calls them: the cache looks for changes in that file and in those of `_SHARED` only.
     """
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
 
@@ -44,12 +124,11 @@ def arithmetic_kernel(function: Callable) -> Callable:
 
 
 def _compiled(function: Callable, **options: object) -> Callable:
+    kernel = numba.njit(**options)(function)
     try:
-        kernel = numba.njit(cache=True, **options)(function)
+        kernel._cache = _KernelCache(function)
     except RuntimeError:  # no folder for the cache
-        return numba.njit(**options)(function)
-    file = kernel._cache._cache_file
-    file._source_stamp = (file._source_stamp, SHARED_CODE)  # numba's own stamp is of the kernel's file alone
+        _announcement.kept = False
     return kernel
 
 

@@ -180,7 +180,7 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, in
     """Fills rows first..last-1, counted through all clips, of index (B,M,k) i64 and count (B,M) i64.
 
     xyz (B,3,N) f32, times (B,N) i64, centroids (B,M,3) f32, centroid_times (B,M) i64, limits (R,) f32 squared radii;
-    see `ball_query.space_time_ball_query`.
+    see `ops.ball_query.space_time_ball_query`.
     """
     rows = centroids.shape[1]
     while first < last:
@@ -350,8 +350,8 @@ def _knn_cloud(order, n, xyz, box, bucket, queries, low, high, squared, index):
 def knn_kernel(order, lengths, xyz, box, bucket, queries, squared, index, first, last):
     """Fills rows first..last-1, counted through all clouds, of squared (B,M,k) f32 and index (B,M,k) i64.
 
-    order, lengths, xyz, box: of `kernels_fps.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
-    `nearest.knn`.
+    order, lengths, xyz, box: of `farthest_point_sampling.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
+    `ops.nearest_neighbors.knn`.
     """
     rows = queries.shape[1]
     while first < last:

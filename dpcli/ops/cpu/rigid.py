@@ -55,12 +55,10 @@ def _unit_columns(m):
 
 @arithmetic_kernel
 def _nearest_rotation(m, v, out):
-    """Writes to out (3,3) the rotation nearest to m (3,3), which is overwritten, by one-sided Jacobi (Hestenes 1958); v (3,3):
-    scratch.
+    """Writes to out (3,3) the rotation nearest to m (3,3), by one-sided Jacobi (Hestenes 1958); m and v (3,3) are overwritten.
 
-    A matrix of rank one or less, which leaves a turn open, leaves out as it is.
-
-    m v = u diag(s) with s falling. The third columns as cross products are the fix of the determinant: no sign to look at.
+    Of a matrix of rank one or less, which leaves a turn open, nothing is written. Else m v = u diag(s) with s descending;
+    with cross products as third columns, u and v have determinant +1, so that no sign has to be looked at.
     """
     for i in range(3):
         for j in range(3):

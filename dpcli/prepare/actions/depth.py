@@ -227,7 +227,9 @@ class DepthVideos:
         if self.fps:
             return kept * self.stride / self.fps
         if video.time is None:
-            cut = f"truncated, it lacks {video.missing} frames that it declares, and " if video.missing else ""
+            cut = (
+                f"truncated, it lacks {counted(video.missing, 'frame')} that it declares, and " if video.missing else ""
+            )
             raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
         return video.time[kept]
 

@@ -299,7 +299,7 @@ class NTU60:
         """Returns lines for the log about what the index holds and lacks."""
         good = [item for item in items if not item.problem]
         setups, splits = Counter(item.name[:4] for item in good), Counter(item.split for item in good)
-        lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} entries unusable"]
+        lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} unusable"]
         lines.append(
             f"{self.protocol}: "
             + ", ".join(f"{split} {splits[split]}/{count}" for split, count in PUBLISHED[self.protocol].items())

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
@@ -158,7 +159,7 @@ class PtsLabel:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
-        lines = [f"{sum(found.values())} gestures found (train {found['train']}, test {found['test']})"]
+        lines = [f"{counted(sum(found.values()), 'gesture')} found (train {found['train']}, test {found['test']})"]
         if found[""]:
             lines.append(f"{found['']} without a split: no train_gestures.txt and test_gestures.txt found (--lists)")
         return lines

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.shrec17_lists import PUBLISHED, find_lists, gesture_names, listed_items
 from dpcli.prepare.decode.cv2_import import load_cv2
@@ -168,7 +169,9 @@ class Shrec17:
             return np.zeros(0), np.zeros((0, 4), np.int64)
         ticks, regions = read_regions(path)
         if self.bbox and len(regions) < frames:
-            raise DataError(f"{path}: regions of {len(regions)} frames; expected {frames} lines, one per frame")
+            raise DataError(
+                f"{path}: regions of {counted(len(regions), 'frame')}; expected {frames} lines, one per frame"
+            )
         return ticks, regions
 
     def _points(self, depth: np.ndarray, x: int, y: int, right: int, bottom: int) -> np.ndarray:

@@ -182,7 +182,7 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: bool = False) -> Any:
-    """Reads one array of an open .npz; with ``pickled`` an object array may be in it, and its only element is returned.
+    """Reads one array of an open .npz; with ``pickled`` it may be of objects, through the allow list.
 
     Raises DataError when the member is absent, damaged, or a pickle that needs more than plain arrays and containers.
     """
@@ -195,19 +195,14 @@ def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: boo
     try:
         data = archive.read(info)
         stream = io.BytesIO(data)
-        if not pickled:
-            return read_member(path, data)
         version = np.lib.format.read_magic(stream)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = header(stream)
-        if dtype.hasobject and shape != ():
-            raise DataError(f"{path}: {key} is an object array of shape {shape}; expected shape ()")
-        if not dtype.hasobject:
-            return read_member(path, data)
-        return load_arrays(stream).item()
+        if pickled and header(stream)[2].hasobject:
+            return load_arrays(stream)
+        return read_member(path, data)
     except pickle.UnpicklingError as error:
         raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None
     except DataError:
         raise
     except Exception as error:  # a damaged zip, header or pickle stream raises nearly anything
-        raise DataError(f"{path}: {key} cannot be read ({type(error).__name__}: {error})") from None
+        raise DataError(f"{path}: {key} cannot be read ({type(error).__name__}: {error}); copy it again") from None

@@ -96,7 +96,7 @@ def study(obj: ArticulatedObject, options: Articulation) -> Study:
     idle = idle_joints(obj, options.min_motion, options.visible_only, generator(0, PrepareStream.OBJECT_STUDY))
     if parts(obj, idle).max() < 1:
         raise DataError(
-            f"{obj.name}: one rigid part only; none of its {len(obj.joints)} joints moves its part "
+            f"{obj.name}: one rigid part only; none of its joints ({len(obj.joints)}) moves its part "
             f"{'visibly ' if options.visible_only else ''}by {options.min_motion} of the object's size (--min-motion)"
         )
     locked = lock_small(obj, idle, _GLUED * options.min_part / options.points_per_frame)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import open_archive
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
@@ -80,6 +81,8 @@ def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _poses(path: Path, trans: Any, views: int, num_parts: int) -> np.ndarray:
+    if isinstance(trans, np.ndarray) and trans.shape == ():
+        trans = trans.item()
     if not isinstance(trans, dict):
         raise DataError(f"{path}: trans holds a {type(trans).__name__}; expected a dict of 'cam' and part ids")
     camera = _matrices(path, trans, "cam", views)
@@ -132,7 +135,9 @@ class MultiBodySync:
                 items.append(Item(name, path, split=_SPLITS[split], extra={"parts": parts}, problem=problem))
         twice = len(items) - len({item.name for item in items})
         if twice:
-            raise DataError(f"{self.raw / 'meta.json'}: {twice} numbers are listed twice; a sample is in one split")
+            raise DataError(
+                f"{self.raw / 'meta.json'}: {counted(twice, 'number')} listed twice; a sample is in one split"
+            )
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
@@ -145,4 +150,4 @@ class MultiBodySync:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in _SPLITS.values()}
-        return [f"{len(items)} samples ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
+        return [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]

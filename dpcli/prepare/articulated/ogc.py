@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import path_inside
@@ -76,7 +77,9 @@ def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndar
             raise DataError(f"{folder / f'pc_{t:02d}.npy'}: holds NaN or infinity; expected finite coordinates")
         pose = read_poses(folder / f"pose_{t:02d}.npy")
         if poses and len(pose) != len(poses[0]):
-            raise DataError(f"{folder / f'pose_{t:02d}.npy'}: {len(pose)} objects, {len(poses[0])} in pose_00.npy")
+            raise DataError(
+                f"{folder / f'pose_{t:02d}.npy'}: {counted(len(pose), 'object')}, {len(poses[0])} in pose_00.npy"
+            )
         clouds.append(cloud.astype(np.float32))
         parts.append(read_segmentation(folder / f"segm_{t:02d}.npy", len(pose), len(cloud)))
         poses.append(pose)
@@ -175,7 +178,9 @@ class OgcRooms:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
-        lines = [f"{len(items)} rooms ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"]
+        lines = [
+            f"{counted(len(items), 'room')} ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"
+        ]
         if len(items) != ROOMS:
-            lines.append(f"{len(items)} rooms where the published set has {ROOMS}")
+            lines.append(f"{counted(len(items), 'room')} where the published set has {ROOMS}")
         return lines

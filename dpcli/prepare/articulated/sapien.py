@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
@@ -163,8 +164,12 @@ class Sapien:
         good = {item.path: item.split for item in items if not item.problem}
         counts = Counter(good.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
-        names = f" of {len(self.class_names)} categories" if self.class_names else ""
-        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"] if good else []
+        names = f" of {counted(len(self.class_names), 'category', 'categories')}" if self.class_names else ""
+        return (
+            [f"{counted(len(good), 'object')}{names} ({shares}), {counted(self.pairs_per_object, 'sequence')} of each"]
+            if good
+            else []
+        )
 
 
 def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
@@ -180,7 +185,7 @@ def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
     except DataError as error:
         return str(error), 0
     if missing:
-        more = f", as are {len(missing) - 1} others" if len(missing) > 1 else ""
+        more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0
     if not skeleton.joints:
         return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0

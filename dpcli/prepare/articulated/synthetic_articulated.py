@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
@@ -99,4 +100,6 @@ class SyntheticArticulated:
         counts = Counter({item.extra["object"]: item.split for item in items}.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
         kinds = min(self.objects, len(self.class_names))  # they take turns
-        return [f"{self.objects} objects of {kinds} kinds ({shares}), {len(items)} sequences"]
+        return [
+            f"{counted(self.objects, 'object')} of {counted(kinds, 'kind')} ({shares}), {counted(len(items), 'sequence')}"
+        ]

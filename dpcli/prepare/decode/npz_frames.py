@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
-import pickle
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
-from dpcli.npy_files import open_archive, read_member, require_room
-from dpcli.prepare.array_files.safe_pickle import load_arrays
+from dpcli.errors import DataError, reading
+from dpcli.npy_files import open_archive
+from dpcli.prepare.array_files.safe_pickle import read_npz_member
 
 
 def member_names(path: Path) -> list[str]:
@@ -29,28 +27,9 @@ def read_frames(path: Path, key: str) -> list[np.ndarray]:
 
     An object array is a pickle: it is read through an allow list of plain arrays. Raises DataError on anything else.
     """
-    try:
-        with open_archive(path) as archive:
-            info = archive.getinfo(f"{key}.npy")
-            require_room(path, info.file_size)
-            array = _read_array(path, archive.read(info))
-    except pickle.UnpicklingError as error:
-        raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None
-    except DataError:
-        raise
-    except Exception as error:  # a damaged zip, header or pickle stream raises nearly anything
-        raise DataError(f"{path}: {key} cannot be read ({type(error).__name__}: {error}); copy it again") from None
+    with reading(path), open_archive(path) as archive:
+        array = read_npz_member(archive, path, key, pickled=True)
     return [_frame(path, key, t, frame) for t, frame in enumerate(_as_frames(path, key, array))]
-
-
-def _read_array(path: Path, data: bytes) -> np.ndarray:
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    _, _, dtype = header(stream)
-    if dtype.hasobject:
-        return load_arrays(stream)
-    return read_member(path, data)
 
 
 def _as_frames(path: Path, key: str, array: object) -> list:

@@ -47,7 +47,7 @@ def clip_outputs(path: Path, output: str) -> list[tuple[str, str]]:
     """
     clips = list_clips(path)
     if all(seconds is None for _, seconds in clips):
-        raise DataError(f"{path}: none of its {len(clips)} clips can be read")
+        raise DataError(f"{path}: none of its clips ({len(clips)}) can be read")
     place, ends = Path(output), file_names([name.split("|")[-1] for name, _ in clips], "clip")
     made = ((clip, place.with_name(f"{place.stem}_{end}{place.suffix}")) for clip, end in zip(clips, ends))
     return [(name, str(file)) for (name, seconds), file in made if seconds is not None]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
@@ -111,7 +112,7 @@ def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | Non
     hidden = hidden_points(mesh, points)
     if hidden.any():
         log.warn(
-            f"{mesh.name}: {hidden.any(0).sum()} of {filming.tracks} tracks are hidden in some frames, a point of no extent there"
+            f"{mesh.name}: hidden in some frames, a point of no extent there: {hidden.any(0).sum()} of {counted(filming.tracks, 'track')}"
         )
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.gltf_extensions import decompress, instances
@@ -184,7 +185,7 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
     primitives = file.item("meshes", node["mesh"]).get("primitives", [])
     kept = [p for p in primitives if p.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)]
     if len(kept) < len(primitives):
-        left = f"{len(primitives) - len(kept)} of {len(primitives)} pieces"
+        left = f"{len(primitives) - len(kept)} of {counted(len(primitives), 'piece')}"
         log.warn(f"{file.path}: points and lines of {node_name(file, index)!r} are left out, {left}")
     skins = _read_skin(file, node["skin"]) if "skin" in node else None
     pieces = [_read_primitive(file, index, primitive, skins) for primitive in kept]
@@ -297,7 +298,9 @@ def _whole_normals(file: Gltf, normals: np.ndarray, computed: np.ndarray, where:
     """Returns normals f32 (V,3), those that are not finite computed from the triangles, with a warning."""
     lost = ~np.isfinite(normals).all(1)
     if lost.any():
-        log.warn(f"{file.path}: {where}: {lost.sum()} normals are NaN or infinite; computed from the triangles")
+        log.warn(
+            f"{file.path}: {where}: {counted(int(lost.sum()), 'normal')} NaN or infinite; computed from the triangles"
+        )
         normals = np.where(lost[:, None], computed, normals)
     return normals
 
@@ -375,7 +378,9 @@ def _repaired(
     if lost.any():
         from scipy.spatial import cKDTree
 
-        log.warn(f"{file.path}: {where}: {lost.sum()} vertices without finite weights follow their nearest neighbors")
+        log.warn(
+            f"{file.path}: {where}: {counted(int(lost.sum()), 'vertex', 'vertices')} without finite weights: as the nearest ones"
+        )
         near = np.flatnonzero(~lost)[cKDTree(positions[~lost]).query(positions[lost])[1]]
         local, weights = local.copy(), weights.copy()
         local[lost], weights[lost] = local[near], weights[near]

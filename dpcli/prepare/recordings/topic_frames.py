@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.recordings.recording import Message, Recording
 
@@ -42,7 +43,7 @@ def read_topic(recording: Recording, topic: str, stride: int, decode: Callable[[
         places.add(message.place)
     declared = recording.topics[topic][1]
     if not frames:
-        raise DataError(f"{recording.path}: {topic} declares {declared} messages and holds none")
+        raise DataError(f"{recording.path}: {topic} declares {counted(declared, 'message')} and holds none")
     order, time, notes = message_times(stamps)
     if recording.read < declared:
         notes[LACKING] = declared - recording.read

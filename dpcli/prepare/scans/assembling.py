@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
@@ -180,7 +181,7 @@ def _colors(item: Item, clouds: list[Cloud]) -> np.ndarray:
     colors = [cloud.color for cloud in clouds if cloud.color is not None]
     if len(colors) < len(clouds):
         raise DataError(
-            f"{item.path}: {len(clouds) - len(colors)} of {len(clouds)} frames have no colors, others have them"
+            f"{item.path}: {len(clouds) - len(colors)} of {counted(len(clouds), 'frame')} without colors, others with them"
         )
     try:
         return np.concatenate(as_bytes(colors))

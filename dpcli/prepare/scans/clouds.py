@@ -135,7 +135,7 @@ class CloudFolders(OwnScans):
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         frames = sum(len(item.extra["series"].names) for item in items)
-        lines = [f"{counted(len(items), 'sequence')} of {frames} frames found"]
+        lines = [f"{counted(len(items), 'sequence')} of {counted(frames, 'frame')} found"]
         if self._first[1]:
             lines[0] += f"; not read: {first_names(self._first[1], _LISTED)}"
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_frame_column
 from dpcli.prepare.reader import natural_key
@@ -153,7 +154,9 @@ def _values_of_words(table: Table, column: str, words: list[str]) -> tuple[np.nd
 def _require_all(table: Table, column: str, filled: np.ndarray) -> None:
     bad = np.flatnonzero(~filled)
     if len(bad):
-        raise DataError(f"{table.path}: {len(bad)} rows, the first is {bad[0] + 1}, have no number in {column!r}")
+        raise DataError(
+            f"{table.path}: {counted(len(bad), 'row')} without a number in {column!r}, the first is {bad[0] + 1}"
+        )
 
 
 def _exact(words: list[str], values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.reader import Item, Sample, describe
@@ -192,14 +193,14 @@ class KittiDetection:
         """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in (*_SPLITS.values(), "")}
         lines = [
-            f"{len(items)} scans ({counts['train']} train, {counts['validation']} validation, {counts['']} in no list)"
+            f"{counted(len(items), 'scan')} ({counts['train']} train, {counts['validation']} validation, {counts['']} in no list)"
         ]
         if not counts["train"] + counts["validation"]:
             lines.append(
                 f"no {self.raw / 'ImageSets'}/train.txt and val.txt: no split is written (--lists names a folder)"
             )
         if len(items) != SCANS:
-            lines.append(f"{len(items)} scans where the published training set has {SCANS}")
+            lines.append(f"{counted(len(items), 'scan')} where the published training set has {SCANS}")
         return lines
 
 

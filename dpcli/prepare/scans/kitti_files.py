@@ -92,7 +92,9 @@ def read_velodyne(path: Path) -> np.ndarray:
         )
     points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
     if not np.isfinite(points).all():
-        raise DataError(f"{path}: {int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite; copy it again")
+        raise DataError(
+            f"{path}: {counted(int((~np.isfinite(points)).any(1).sum()), 'point')} NaN or infinite; copy it again"
+        )
     return points
 
 

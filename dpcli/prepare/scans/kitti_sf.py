@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
@@ -179,7 +180,8 @@ class KittiSceneFlow:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         good = sum(not item.problem for item in items)
-        lines = [f"{good} of {len(items)} scenes have all their files ({sum(i.split == 'train' for i in items)} train)"]
+        train = sum(item.split == "train" for item in items)
+        lines = [f"{good} of {counted(len(items), 'scene')} with all their files ({train} train)"]
         if len(items) != SCENES:
-            lines.append(f"{len(items)} scenes where the published training set has {SCENES}")
+            lines.append(f"{counted(len(items), 'scene')} where the published training set has {SCENES}")
         return lines

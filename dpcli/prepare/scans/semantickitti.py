@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.prepare.scans.kitti_files import (
@@ -131,7 +132,7 @@ class SemanticKitti:
                     Item(f"{sequence}_{window[0]}", folder, split=split, extra={"scans": window}, problem=problem)
                 )
         if not items:
-            raise DataError(f"{self.raw}: no sequence holds {self.frames} scans (velodyne/000000.bin ...)")
+            raise DataError(f"{self.raw}: no sequence holds {counted(self.frames, 'scan')} (velodyne/000000.bin ...)")
         return items
 
     def _problem(self, folder: Path, window: list[str]) -> str:
@@ -189,18 +190,22 @@ class SemanticKitti:
             return np.tile(np.eye(4), (len(numbers), 1, 1))
         poses = read_poses(item.path / "poses.txt")
         if numbers[-1] >= len(poses):
-            raise DataError(f"{item.path / 'poses.txt'}: {len(poses)} lines, none for scan {item.extra['scans'][-1]}")
+            raise DataError(
+                f"{item.path / 'poses.txt'}: {counted(len(poses), 'line')}, none for scan {item.extra['scans'][-1]}"
+            )
         return np.linalg.inv(poses[numbers[0]]) @ poses[numbers]
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         held = sum(len(list((folder / "velodyne").glob("*.bin"))) for _, folder in self._folders())
         found = [name for name, _ in self._folders()]
-        lines = [f"{len(items)} samples of {self.frames} scans, sequences {', '.join(found)}"]
+        lines = [f"{counted(len(items), 'sample')} of {counted(self.frames, 'scan')}, sequences {', '.join(found)}"]
         missing = [name for name in GROUPS[self.group] if name not in found]
         if missing:
             lines.append(f"sequences not there: {', '.join(missing)}")
         left = held - len(items) * self.frames
         if left:
-            lines.append(f"{left} scans at the ends of sequences are left out: fewer than --frames {self.frames}")
+            lines.append(
+                f"{counted(left, 'scan')} at the ends of sequences left out: fewer than --frames {self.frames}"
+            )
         return lines

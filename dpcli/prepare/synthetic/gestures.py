@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
@@ -193,7 +194,7 @@ class SyntheticGestures:
         split = f"subjects 1-{train} of {seen} train, the others test"
         if seen == 1:
             split = "all are of subject 1 and train; with --videos-per-class 2 or more, another subject tests"
-        return [f"{len(items)} videos of {len(CLASS_NAMES)} gestures; {split}"]
+        return [f"{counted(len(items), 'video')} of {len(CLASS_NAMES)} gestures; {split}"]
 
 
 def to_camera(points: np.ndarray, yaw: float, place: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.synthetic.spinning_lidar import LIDARS, scan
@@ -91,4 +92,6 @@ class SyntheticStreets:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds."""
         counts = Counter(item.split for item in items)
-        return [f"{counts['test']} streets, {self.frames} frames of a lidar with {self.rows} beams"]
+        return [
+            f"{counted(counts['test'], 'street')}, {counted(self.frames, 'frame')} of a lidar with {self.rows} beams"
+        ]

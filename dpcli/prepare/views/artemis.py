@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
@@ -144,7 +145,9 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
 def _read_rig(animal: Path) -> _Rig:
     to_world, intrinsics = read_poses(animal / "CamPose.inf"), read_intrinsics(animal / "Intrinsic.inf")
     if len(to_world) != len(intrinsics):
-        raise DataError(f"{animal}: CamPose.inf has {len(to_world)} cameras, Intrinsic.inf {len(intrinsics)}")
+        raise DataError(
+            f"{animal}: CamPose.inf has {counted(len(to_world), 'camera')}, Intrinsic.inf {len(intrinsics)}"
+        )
     return _Rig(intrinsics, np.linalg.inv(to_world))
 
 
@@ -281,7 +284,9 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
         good.append(frame)
         boxes.append(row)
     if not good:
-        raise DataError(f"{motion.name}: none of its {len(frames)} frames is whole in all of cameras {_ranges(views)}")
+        raise DataError(
+            f"{motion.name}: none of its frames ({len(frames)}) is whole in all of cameras {_ranges(views)}"
+        )
     if cut_off:
         log.warn(f"the object leaves the picture in {first_names(cut_off, 8)}")
     if len(good) == 1:

@@ -111,7 +111,7 @@ def read_views(path: Path) -> tuple[list[View], list[float]]:
         )
     if len(whole) < len(views):
         log.warn(
-            f"{path}: {len(views) - len(whole)} of {len(views)} cameras lack some of the {len(times)} times; left out"
+            f"{path}: {len(views) - len(whole)} of {len(views)} cameras without a picture at some of the {len(times)} times; left out"
         )
     whole.sort(key=lambda view: view.role != "train")
     return whole, sorted(times)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.path_names import first_names
@@ -210,14 +211,16 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         )
     if cutter.options.holes == "auto" and any(cutter.gaps.values()):
         count = sum(gap > 0 for gap in cutter.gaps.values())
-        log.info(f"{frames.path}: gaps in the object are see-through in {count} frames (--holes keep fills them)")
+        log.info(
+            f"{frames.path}: gaps in the object are see-through in {counted(count, 'frame')} (--holes keep fills them)"
+        )
     if len(good) == 1:
         log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
     crop = crop_around(union(boxes), options.border) if options.recenter else whole_picture(width, height)
     if crop.side < options.size / 1.5:
         log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
     log.info(
-        f"{frames.path}: {len(good)} of {len(frames)} frames, {width}x{height}; object from {_how(cutter)}; "
+        f"{frames.path}: {len(good)} of {counted(len(frames), 'frame')}, {width}x{height}; object from {_how(cutter)}; "
         f"square of {crop.side} at ({crop.left}, {crop.top})"
     )
     return cutter, good, crop, (width, height)
@@ -252,7 +255,7 @@ def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
         except DataError as error:
             log.warn(f"left out: {error}")
     if not good:
-        raise DataError(f"{frames.path}: none of its {len(wanted)} frames can be read")
+        raise DataError(f"{frames.path}: none of its frames ({len(wanted)}) can be read")
     return good
 
 
@@ -329,7 +332,8 @@ def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...] | Frames:
         return tuple(place[number] for number in frames.numbers)
     if len(masks) != len(frames):
         raise DataError(
-            f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike, with all its objects"
+            f"{folder}: {counted(len(masks), 'mask')} for {counted(len(frames), 'frame')}; expected one for each, named alike,"
+            " with all its objects"
         )
     if folder.is_dir() and masks.numbers != frames.numbers:
         pairs = [f"{masks.names[at]} for {frames.names[at]}" for at in (0, -1)]

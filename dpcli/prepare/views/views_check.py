@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.color_frames import Frames, open_frames
@@ -35,7 +36,9 @@ class ArtemisIndex:
         """
         poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
         if len(poses) != len(cameras):
-            raise DataError(f"{self.animal}: CamPose.inf has {len(poses)} cameras, Intrinsic.inf {len(cameras)}")
+            raise DataError(
+                f"{self.animal}: CamPose.inf has {counted(len(poses), 'camera')}, Intrinsic.inf {len(cameras)}"
+            )
         images, declared = require_folder(self.animal / "img", "MOTION/FRAME/"), declared_frames(self.animal)
         there = {path.name for path in images.iterdir() if path.is_dir()}
         names = [self.motion] if self.motion else sorted(there | declared.keys())
@@ -53,7 +56,7 @@ class ArtemisIndex:
         except DataError as error:
             return f"{self.animal / 'sequences'}: {error}"
         if not folder.is_dir():
-            return f"img/{name}: missing" + (f"; sequences gives it {declared} frames" if declared else "")
+            return f"img/{name}: missing" + (f"; sequences gives it {counted(declared, 'frame')}" if declared else "")
         try:
             motion = find_motion(self.animal, name)
         except DataError as error:
@@ -62,7 +65,7 @@ class ArtemisIndex:
         faults = [f"{count} of the {declared} frames are there"] if count < declared else []
         lacking = [*_lacking_pictures(motion, cameras), *self._lacking_bones(motion)]
         if lacking:
-            faults.append(f"{len(lacking)} files are missing, the first: {lacking[0]}")
+            faults.append(f"{counted(len(lacking), 'file')} missing, the first: {lacking[0]}")
         return "; ".join(faults)
 
     def _lacking_bones(self, motion: Motion) -> Iterator[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, reading
 from dpcli.runtime.clips.container_ends import pictures_in
 from dpcli.runtime.clips.gif_pictures import check_canvas, gif_canvases
@@ -55,7 +56,7 @@ def animation_times(path: Path) -> tuple[float, ...]:
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
     if (behind := pictures_in(path) - len(times)) > 0:
-        log.warn(f"{path}: {behind} pictures follow the {len(times)} that its header counts, and are left out")
+        log.warn(f"{path}: {counted(behind, 'picture')} behind the {len(times)} that its header counts: left out")
     return tuple(times)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.runtime.clips import wide_color
@@ -206,7 +207,7 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
             return list(paths)
         if not quiet:
             log.warn(
-                f"{folder}: left out {len(others)} of {len(paths)} images, whose names are not like {kept[0].name}: "
+                f"{folder}: left out {len(others)} of {counted(len(paths), 'image')}, whose names are not like {kept[0].name}: "
                 f"{first_names(others, _NAMED)}"
             )
         return kept

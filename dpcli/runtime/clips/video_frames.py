@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
@@ -231,17 +232,19 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
         (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times, cut)
     )
     if failed or declared > held + (not cut):
-        of = f" of its {declared}" if declared else ""
+        of = f"its {counted(declared, 'frame')}" if declared else "its frames"
         raise DataError(
-            f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
+            f"{path}: of {of} only {held} can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
     if (promised := promised_frames(path)) > max(declared, held) + empty_frames(path, stream.index):
         log.warn(
-            f"{path}: its main header promises {promised} frames; it holds {held}, as the header of its stream says"
+            f"{path}: its main header promises {counted(promised, 'frame')}; it holds {held}, as the header of its stream says"
         )
     if left := empty_frames(path, stream.index):
-        log.warn(f"{path}: {left} frames have no bytes: the program that recorded it left them out, as they are here")
+        log.warn(
+            f"{path}: {counted(left, 'frame')} without bytes: the program that recorded it left them out, and so does this"
+        )
     if cut:
         log.warn(f"{path}: the file ends before its container does; frames after the {held} that it holds may be lost")
 

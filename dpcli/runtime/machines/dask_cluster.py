@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
+from dpcli.counted import counted
 from dpcli.errors import DpcError, UsageError
 from dpcli.runtime.progress import log
 
@@ -57,5 +58,5 @@ def _slots(client: object, address: str) -> int:
     client.wait_for_workers(1, timeout=_CONNECT_SECONDS)  # type: ignore[attr-defined]
     threads = client.nthreads()  # type: ignore[attr-defined]
     slots = sum(threads.values())
-    log.info(f"Dask {address}: {len(threads)} workers, {slots} items at a time")
+    log.info(f"Dask {address}: {counted(len(threads), 'worker')}, {counted(slots, 'item')} at a time")
     return slots

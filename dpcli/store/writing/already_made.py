@@ -13,7 +13,7 @@ from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.writing.journal import sweep
 
 WORK = ("config", "seed", "inputs", "version")  # what makes two commands the same work, data and program included
-_PLAIN = ("seed", "version")
+_PLAIN = ("seed", "version", "inputs")
 _NAMED = 4  # differences that a refusal names
 
 
@@ -56,6 +56,4 @@ def already_made(
 def _describe_differences(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Returns the first settings that differ, and the inputs that are other files, in words."""
     old, new = ({**entry.get("config", {}), **{key: entry.get(key) for key in _PLAIN}} for entry in (before, now))
-    inputs, own = before.get("inputs") or {}, now.get("inputs") or {}
-    others = [f"another {role} file" for role in sorted({*inputs, *own}) if inputs.get(role) != own.get(role)]
-    return "with " + ("; ".join([*differences(old, new), *others][:_NAMED]) or "other settings")
+    return "with " + ("; ".join(differences(old, new)[:_NAMED]) or "other settings")

@@ -6,7 +6,6 @@ early. What a sample is and where it goes is its subclass's.
 
 from __future__ import annotations
 
-import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from dpcli.config_diff import differences
+from dpcli.counted import counted
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.runtime.whole_file import DiskFull, disk_full, not_writable, refuse_existing
 from dpcli.store.file import history_of, write_positions, write_root, write_skipped
@@ -120,8 +120,7 @@ class ResumableWriter(ABC):
     def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:
         """Returns the error that says that what was kept is of other work; it stays."""
         old, new = ({**about, **(about.get("provenance") or [{}])[-1], "provenance": None} for about in (other, mine))
-        some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
-        said = "; ".join(some) or "an earlier step of its files differs"
+        said = "; ".join(differences(old, new)[:3]) or "an earlier step of its files differs"
         return UsageError(
             f"{self.path}: a stopped run with other settings or inputs ({said}) left its work here; run that command again to continue it,"
             " write to another file, or --force to start over"
@@ -181,7 +180,7 @@ class ResumableWriter(ABC):
     def _kept(self) -> str:
         """Returns what a run that continues finds, in words; "" where that is nothing."""
         # not `len`, which counts the sample that found no room, too
-        return f"the {self._recorded} samples done are kept" if self._journal and self._recorded else ""
+        return f"what is done, {counted(self._recorded, 'sample')}, is kept" if self._journal and self._recorded else ""
 
     def _needed(self) -> int:
         """Returns about how many bytes all samples take, journal and all, estimated from those done; 0 where unknown."""

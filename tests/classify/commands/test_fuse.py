@@ -71,7 +71,7 @@ def test_weights(two, tmp_path):
     np.testing.assert_allclose(parse_weights("0.7,0.3", ["a", "b"]), [0.7, 0.3])
     np.testing.assert_allclose(parse_weights("b=0.3,a=0.7", ["a", "b"]), [0.7, 0.3])
     for text, message in (
-        ("0.5", "1 weights for 2"),
+        ("0.5", "1 weight for 2"),
         ("a,b", "expected numbers"),
         ("-1,2", "from 0 up"),
         ("0,0", "not all"),
@@ -85,7 +85,7 @@ def test_weights(two, tmp_path):
             parse_weights(text, ["a", "b"])
     with pytest.raises(UsageError, match="expected a=NUMBER,b=NUMBER"):
         parse_weights("1,2", ["a", "b"], named=True)
-    with pytest.raises(UsageError, match="1 weights for 2"):  # told before any file is looked at
+    with pytest.raises(UsageError, match="1 weight for 2"):  # told before any file is looked at
         fuse([tmp_path / "absent.h5", two[0]], tmp_path / "none.h5", "0.5")
 
 
@@ -296,7 +296,7 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     np.testing.assert_allclose(chosen(two, by).provenance[-1]["config"]["weights"], [1, 0], atol=1e-3)
     for inputs, judged, error, message in (
         ([one], str(one), DataError, "'v0' is among the fused videos"),
-        (two, str(judge), UsageError, "1 files for 2"),
+        (two, str(judge), UsageError, "1 file for 2"),
         ([one], str(two[0]), UsageError, "without streams"),
         (two, f"{two[0]},{two[1]}", DataError, r"\(3 such videos\)"),
         (

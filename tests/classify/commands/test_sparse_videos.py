@@ -143,7 +143,7 @@ def test_an_hour_is_one_clip_with_a_warning(tmp_path, capsys):
     capsys.readouterr()
     words = ("--model", tmp_path / "run", "-o", tmp_path / "s.h5", "--clips-per-video", 1)
     assert dpc("classify", "predict", tmp_path / "hour.h5", *words) == 0
-    assert "1 of 1 videos are over 5 times as long as any" in capsys.readouterr().err
+    assert "1 of 1 video over 5 times as long as any" in capsys.readouterr().err
 
 
 def test_a_stream_of_places_alone_is_predicted_by_its_window(tmp_path):

@@ -57,7 +57,7 @@ def test_frames_without_points_are_told_where_clips_show_them(tmp_path, capsys):
             writer.write(CloudSequence.from_frames(name, frames, label=0))
     empty = CloudsReader(tmp_path / "e.h5")
     report_short(ClipSource(empty, [0, 1], CONFIG), 4)
-    assert "2 frames without points in 1 videos are taken as points at the origin: gaps" in capsys.readouterr().err
+    assert "2 frames without points in 1 video taken as points at the origin: gaps" in capsys.readouterr().err
     report_short(ClipSource(empty, [0], CONFIG), 4)
     report_short(ClipSource(empty, [0, 1], CONFIG.changed(scales=(1.0,)), timing="slots"), 4)
     assert capsys.readouterr().err == ""

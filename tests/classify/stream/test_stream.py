@@ -256,7 +256,7 @@ BAD = {
     "two columns": (npy(np.ones((5, 2), np.float32)), r"shape \(5, 2\)"),
     "objects": (npy(np.array([[None] * 3], object), allow_pickle=True), "object"),
     "complex": (npy(np.ones((5, 3), np.complex64)), "complex64"),
-    "NaN": (npy(np.where(np.eye(5, 3), np.nan, GOOD)), "3 of 5 points are NaN"),
+    "NaN": (npy(np.where(np.eye(5, 3), np.nan, GOOD)), "3 of 5 points NaN"),
     "too large for f32": (npy(np.full((5, 3), 1e300)), "5 of 5 points"),
     "a wild count": (npy(GOOD).replace(b"(5, 3)", b"(9999999999, 3)"), "at most"),
     "a damaged header": (npy(GOOD).replace(b"'descr'", b"'d\xffscr'"), "damaged"),

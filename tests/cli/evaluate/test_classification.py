@@ -158,7 +158,7 @@ def test_no_labels_at_all_points_to_truth(tmp_path: Path) -> None:
     path = tmp_path / "s.h5"
     with ScoresWriter(path, class_names=NAMES) as writer:
         writer.write("x", np.zeros(3))
-    with pytest.raises(DataError, match="none of 1 samples has a label.*--truth"):
+    with pytest.raises(DataError, match="1 sample without a label.*--truth"):
         evaluate_classification(path)
 
 

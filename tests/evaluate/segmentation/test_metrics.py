@@ -383,7 +383,7 @@ def test_split_and_intersect(files, tmp_path, truths):
     fewer = write_truth(tmp_path / "fewer.h5", truths[1:])
     assert "has no 's0', which" in str(run(parts, "--truth", fewer).exception)
     text = run(parts, "--truth", fewer, "--intersect").stdout
-    assert "the truth doesn't have: 1 sequences (s0)" in text
+    assert "the truth doesn't have: 1 sequence (s0)" in text
 
 
 def test_files_that_do_not_fit_name_the_first_difference(files, tmp_path, truths):

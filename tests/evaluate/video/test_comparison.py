@@ -63,7 +63,7 @@ def test_means_of_roles_and_of_all(said: Path, truth: Path) -> None:
 
 def test_equal_videos_are_capped_and_counted(truth: Path) -> None:
     result = run(truth, "--truth", truth)
-    assert "12 frames are equal and count as 100 dB" in result.stdout
+    assert "12 frames equal to the truth, counted as 100 dB" in result.stdout
     report = evaluate_video(truth, truth)
     assert set(numbers(report, "psnr")) == {PSNR_CAP} and set(numbers(report, "ssim")) == {1.0}
     assert [view.metrics.worst for view in report.views] == [-1] * 4
@@ -179,7 +179,7 @@ def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> N
         {
             "reason": "frames in which the prediction has NaN or infinite pixels",
             "count": 2,
-            "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixels)"],
+            "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixel)"],
         }
     ]
     assert found["denominators"]["frames"] == 10
@@ -190,7 +190,7 @@ def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> N
     np.save(tmp_path / "all.npy", np.full_like(values, np.nan))
     with pytest.raises(DataError, match="every frame has NaN"):
         evaluate_video(tmp_path / "all.npy", truth, intersect=True)
-    with pytest.raises(DataError, match="nan.npy: view '2', frame 1: 2 pixels are NaN"):
+    with pytest.raises(DataError, match="nan.npy: view '2', frame 1: 2 pixels that are NaN"):
         evaluate_video(whole, tmp_path / "nan.npy")
 
 
@@ -199,7 +199,7 @@ def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
     some[0, 1, ..., 3] = 0
     part = write(tmp_path / "part.h5", some)
     result = run(truth, "--truth", part)
-    assert "1 frames without an object in the truth" in result.stdout
+    assert "1 frame without an object in the truth" in result.stdout
     assert "Predicted pictures without an object (alpha 0 everywhere): 1." in run(part, "--truth", truth).stdout
     some[..., 3] = 0
     none = write(tmp_path / "none.h5", some)

@@ -186,7 +186,7 @@ def test_items_are_found_below_and_sorted(tmp_path):
         (b"", "0 bytes"),
         (bin_bytes(np.zeros((0, 6, 8), int)), "empty video: 0 frames"),
         (bin_bytes(np.zeros((3, 0, 8), int)), "8x0 pixels"),
-        (bin_bytes(np.zeros((3, 6, 8), int)), "none of its 3 frames has a valid depth"),
+        (bin_bytes(np.zeros((3, 6, 8), int)), r"none of its frames \(3\) has a valid depth"),
         (b"\xff" * 100, "frames of 4294967295x4294967295 pixels"),
     ],
 )

@@ -207,10 +207,10 @@ def test_bad_frames(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0 190 90 70 80\n", "general_informations.txt: regions of 1 frames; expected 3 lines"),
+        ("0 190 90 70 80\n", "general_informations.txt: regions of 1 frame; expected 3 lines"),
         ("0 190 90 70 80\n1 190 90 70\n", r"general_informations.txt:2: '1 190 90 70'; expected 5 numbers"),
         ("0 190 90 70 nan\n", "general_informations.txt:1: '0 190 90 70 nan'; expected 5 numbers"),
-        ("0 700 90 70 80\n1 700 90 70 80\n2 9 9 0 0", "none of its 3 frames has a valid depth pixel"),
+        ("0 700 90 70 80\n1 700 90 70 80\n2 9 9 0 0", "none of its frames (3) has a valid depth pixel"),
     ],
 )
 def test_bad_regions(tmp_path, text, message):

@@ -178,7 +178,7 @@ def test_missing_arrays_and_files(tmp_path):
         ("{", "not JSON"),
         ("[1]", "expected"),
         ('{"train": ["a"]}', "expected"),
-        ('{"train": [1, 1]}', "1 numbers are listed twice"),
+        ('{"train": [1, 1]}', "1 number listed twice"),
     ],
 )
 def test_meta_json(text, words, tmp_path):

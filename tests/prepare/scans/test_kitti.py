@@ -379,7 +379,7 @@ def test_damaged_scans_and_lists(tmp_path):
     for data, words in (
         (good[:-3], "expected some points of 16"),
         (b"", "0 bytes"),
-        (np.full(4, np.nan, "<f4").tobytes(), "1 points are NaN"),
+        (np.full(4, np.nan, "<f4").tobytes(), "1 point NaN"),
         (np.full(4, -9, "<f4").tobytes(), "no point in the camera's view"),
     ):
         scan.write_bytes(data)

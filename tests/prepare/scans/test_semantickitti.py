@@ -104,7 +104,7 @@ def test_command_windows_and_skipped(tmp_path):
         "prepare", "semantickitti", raw, "--group", "only-08", "--frames", 2, "-o", tmp_path / "x.h5", "--jobs", 1
     )
     assert done.returncode == 0, done.stderr
-    assert "1 scans at the ends of sequences are left out: fewer than --frames 2" in done.stderr
+    assert "1 scan at the ends of sequences left out: fewer than --frames 2" in done.stderr
     with CloudsReader(tmp_path / "x.h5") as reader:
         assert reader.names == ["08_000000", "08_000002"] and reader.frame_counts.tolist() == [2, 2]
         assert reader.skipped[0][0] == "08_000004" and "000004.label: missing" in reader.skipped[0][1]
@@ -134,7 +134,7 @@ def test_alignment_puts_what_stands_still_in_one_place(tmp_path):
     assert np.linalg.norm(plain.frame(1)[:, None] - plain.frame(0), axis=2).min(1).max() > 0.05
     (folder / "poses.txt").write_text(" ".join(["1"] * 12) + "\n")
     read_poses.cache_clear()
-    with pytest.raises(DataError, match="1 lines, none for scan 000002"):
+    with pytest.raises(DataError, match="1 line, none for scan 000002"):
         reader.read(item, None)
 
 

@@ -216,7 +216,7 @@ def test_tables_that_cannot_be_split(tmp_path):
     (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
     assert "which column numbers the frames? give --frame-column NAME; found x, y, z" in item.problem
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
-    assert "1 rows, the first is 1, have no number in 'frame'" in item.problem
+    assert "1 row without a number in 'frame', the first is 1" in item.problem
     (item,) = TableSequences(write(tmp_path / "c.csv", [("p", 1, 2, 3)]), gap=2).items()
     assert "--gap needs numbers" in item.problem
     with pytest.raises(UsageError, match="--gap 0: expected more than 0"):

@@ -140,7 +140,7 @@ def test_names_of_frames_in_the_order_of_the_alphabet_are_put_in_that_of_their_n
     assert only_sequence(path)[0].points[:, 0].tolist() == [0, 1, 2]
     csv(tmp_path / "c.csv", "frame,x,y,z", [("a", 1, 1, 1), ("", 1, 1, 1)])
     (item,) = TableSequences(tmp_path / "c.csv").items()
-    assert "1 rows, the first is 2, have no number in 'frame'" in item.problem
+    assert "1 row without a number in 'frame', the first is 2" in item.problem
 
 
 @pytest.mark.parametrize("first", [2**53, 1_709_640_000_123_456_789, 2**64 - 9])

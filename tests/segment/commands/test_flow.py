@@ -26,7 +26,7 @@ def test_a_flow_estimator_is_trained_and_used(dpc_here, one_thread, data, tmp_pa
     other = dpc_here(*words)
     assert other.returncode == 2 and b"exists, made with another flow file" in other.stderr
     other = dpc_here(*learn)
-    assert other.returncode == 2 and b"another configuration (flow_weights" in other.stderr, other.stderr
+    assert other.returncode == 2 and b"another configuration (other flow weights" in other.stderr, other.stderr
 
 
 def test_nothing_is_learned_from_what_is_held_out(dpc_here, tmp_path):

@@ -133,6 +133,8 @@ def test_kernel_convolution_equals_its_reference_and_its_gradients_do():
         assert (a - b).abs().max() < 2e-3 * b.abs().max()
     with pytest.raises(ValueError, match="slot"):
         kernel_convolution(features, index, weight, slot[:, :5], matrix)
+    with pytest.raises(ValueError, match=r"0\.\.29"):
+        kernel_convolution(features, index + 1, weight, slot, matrix)
 
 
 def test_group_convolution_gradients_against_plain_indexing():

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import knn
-from dpcli.ops.backend import chosen_backend, run_in_threads, squared_distances
+from dpcli.ops.backend import check_rows, chosen_backend, run_in_threads, squared_distances
 from dpcli.runtime.mixed_precision import full_precision
 
 _DISTANCES = 1 << 24  # distances held at once between features, 64 MiB
@@ -157,8 +157,9 @@ def pool_edges(values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
     """Returns maximum and sum over each point's neighbors, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
 
     The gathered (B,N,K,C) are never all held: a kernel makes none, torch makes and pools them piece by piece on a CPU.
-    Equally large neighbors share the maximum's gradient, as in torch.amax.
+    Equally large neighbors share the maximum's gradient, as in torch.amax. Raises ValueError, on CPU, on an index out of range.
     """
+    check_rows(idx, values.shape[1])
     if values.dtype in (torch.float32, torch.float64) and idx.numel() and chosen_backend(values.device) == "numba":
         return _PooledByKernel.apply(values.contiguous(), idx.contiguous())
     batch, count, channels = values.shape
