@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dpcli.store import CloudsReader
+from dpcli.store.views import ViewsReader
 from tests.support.commands import exit_code
 
 SECONDS = np.cumsum([0.0, 0.1, 0.25, 0.1, 0.05, 0.2])
@@ -100,3 +101,17 @@ def test_names_that_are_times_and_a_given_rate_come_first_and_nothing_above_the_
     np.testing.assert_allclose(
         converted("clouds", tmp_path / "raw", tmp_path / "a.h5", capfd)[0], np.arange(6) / 2, atol=1e-5
     )
+
+
+def test_pictures_of_a_clip_have_their_times(tmp_path, capfd):
+    rng = np.random.default_rng(0)
+    for t in range(6):
+        picture = np.zeros((24, 24, 4), np.uint8)
+        picture[6:18, 4 + t : 14 + t] = [*rng.integers(0, 255, 3), 255]
+        cv2.imwrite(str(tmp_path / f"{t}.png"), picture)
+    (tmp_path / "times.txt").write_text("\n".join(FORMS["dates"](SECONDS)))
+    assert exit_code("prepare", "video", tmp_path, "-o", tmp_path / "v.h5", "--size", 32) == 0
+    said = capfd.readouterr().err
+    assert "its frames have the times in times.txt" in said and "assumed" not in said
+    with ViewsReader(tmp_path / "v.h5") as reader:
+        np.testing.assert_allclose(reader.header.time, SECONDS, atol=1e-5)

@@ -13,7 +13,8 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
-from dpcli.prepare.series import about_series, choose_series
+from dpcli.prepare.series import Series, about_series, choose_series
+from dpcli.prepare.times_beside import with_times
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
@@ -175,7 +176,11 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     numbers = frame_numbers(stems)
     if any(a >= b for a, b in zip(numbers, numbers[1:])):
         numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3
-    return Frames(folder, tuple(p.name for p in paths), tuple(numbers), tuple(paths))
+    names = tuple(path.name for path in paths)
+    beside = with_times(Series(folder, names, pattern), folder).beside
+    if beside and not quiet:
+        log.info(f"{folder}: its frames have the times in {beside.path.name}")
+    return Frames(folder, names, tuple(numbers), tuple(paths), tuple(beside.seconds.tolist()) if beside else None)
 
 
 def _held_instead(folder: Path) -> str:
