@@ -11,10 +11,15 @@ from dpcli.prepare.synthetic.creature import Creature
 from dpcli.prepare.synthetic.gait import Turns, X, Y, Z
 
 _PAIRS = (0, 1, 2, 2, 2, 2, 3, 4)  # pairs of legs, as often as they stand here
+_ROUND = (
+    0.15  # share of figures whose trunk and head are one: what is round from the front need not be a long body's end
+)
 
 
 def wild_creature(rng: np.random.Generator) -> Creature:
     """Draws a creature of random plan, about 1 long or high; it looks along +z, y is up, the ground is near y = 0."""
+    if rng.random() < _ROUND:
+        return _round_figure(rng)
     upright = rng.random() < 0.2
     pairs = 1 if upright else int(rng.choice(_PAIRS))
     animal = Creature("wild", leg=_length(pairs, upright, rng))
@@ -31,6 +36,32 @@ def wild_creature(rng: np.random.Generator) -> Creature:
         _wings(animal, spine, girth, rng)
     if rng.random() < (0.7 if pairs == 0 else 0.1):
         _fin(animal, spine, girth, rng)
+    return animal
+
+
+def _round_figure(rng: np.random.Generator) -> Creature:
+    """Draws an upright figure of one piece, from balls to pillars, on short legs or none; toys and mascots are built so."""
+    u = rng.uniform
+    girth = u(0.2, 0.45)
+    animal = Creature("wild", leg=u(0.02, 0.25))
+    foot = np.array([0, animal.leg + 0.9 * girth, 0])
+    spine = foot + np.linspace(0, 1, 4)[:, None] * np.array([0, u(0.0, 2.5) * girth, u(-0.1, 0.1)])
+    girths = girth * np.interp(np.linspace(0, 1, 4), [0, 0.5, 1], [1, u(0.8, 1.15), u(0.5, 1.1)])
+    for k in range(3):
+        bone = animal.bone(f"spine_{k}", "" if k == 0 else f"spine_{k - 1}", spine[k])
+        animal.shape(bone, spine[k], spine[k + 1], girths[k], girths[k + 1])
+    head = animal.bone("head", "spine_2", spine[3])
+    animal.shape(head, spine[3], spine[3] + [0, 0.02, 0], girths[3], girths[3])
+    animal.add_eyes("head", spine[3], (u(0.2, 0.5), u(-0.1, 0.4), 0.85), u(0.08, 0.35) * girths[3])
+    if rng.random() < 0.4:
+        tip = spine[3] + girths[3] * np.array([0, u(-0.4, 0.1), u(1.1, 1.5)])
+        animal.shape(head, spine[3], tip, u(0.1, 0.3) * girths[3], u(0.05, 0.2) * girths[3], "horn")
+    if animal.leg > 0.08:
+        _pair_of_legs(animal, spine, girths, 0, 1, True, rng)
+    if rng.random() < 0.8:
+        _pair_of_arms(animal, np.repeat(spine[[1]], 4, axis=0), girths, True, rng)
+    if rng.random() < 0.2:
+        _tail(animal, spine[0], girths[0], rng)
     return animal
 
 

@@ -26,6 +26,19 @@ def test_creatures_differ_in_plan_and_each_is_one_finite_body():
     assert {0, 2, 4} <= legs and max(legs) > 4
 
 
+def test_some_creatures_are_round_and_upright():
+    """Without a neck, and about as deep as they are wide, whatever the arms do."""
+    drawn = [(rng := np.random.default_rng(seed), wild_creature(rng)) for seed in range(80)]
+    figures = [(rng, animal) for rng, animal in drawn if not any(bone.name.startswith("neck") for bone in animal.bones)]
+    assert 4 <= len(figures) <= 24
+    for rng, animal in figures[:4]:
+        skin = make_skin(animal, rng, 40)
+        strongest = skin.bones[np.arange(len(skin.bones)), skin.weights.argmax(1)]
+        trunk = skin.vertices[np.char.startswith([animal.bones[bone].name for bone in strongest], "spine")]
+        width, _, depth = np.ptp(trunk, axis=0)
+        assert 0.7 < depth / width < 1.4 and animal.eyes
+
+
 def test_a_creature_takes_poses_that_differ():
     mesh = made_creature(np.random.default_rng(3))
     assert mesh.num_frames > 1 and np.abs(mesh.positions[1] - mesh.positions[0]).max() > 0.02
