@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.counted import counted
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.text_numbers import decode_text
 from dpcli.prepare.scans.times_of_tables import clock_seconds, seconds_of
 from dpcli.prepare.series import Series, TimesBeside
 
@@ -43,17 +45,19 @@ def with_times(series: Series, root: Path) -> Series:
 
 def _seconds(path: Path) -> np.ndarray:
     """Returns the times of all rows in seconds, f64; none where a row holds something else, or they don't rise."""
-    lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
+    try:
+        lines = [line.strip() for line in decode_text(path).split("\n")]
+    except (DataError, OSError):  # it is named as one without times
+        return np.zeros(0)
     rows = [line for line in lines if line and not line.startswith("#")]
-    if rows and not any(letter.isdigit() for letter in rows[0]):  # the name of the column
-        rows = rows[1:]
+    column = rows.pop(0) if rows and not any(letter.isdigit() for letter in rows[0]) else "time"
     try:
         values = np.array([float(row) for row in rows])
     except ValueError:
         seconds = np.array(clock_seconds(rows))
     else:
         known = len(values) > 1 and np.isfinite(values).all()
-        seconds = values * seconds_of("time", values) if known else values[:0]
+        seconds = values * seconds_of(column, values) if known else values[:0]
     return seconds if (np.diff(seconds) > 0).all() else seconds[:0]
 
 

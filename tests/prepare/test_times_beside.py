@@ -27,6 +27,7 @@ FORMS = {
     "milliseconds since 1970": lambda s: [str(round(1.7e12 + one * 1e3)) for one in s],
     "nanoseconds since 1970": lambda s: [str(1_700_000_000_000_000_000 + round(one * 1e9)) for one in s],
     "dates": dates,
+    "a unit in the name": lambda s: ["time [ms]", *(str(round(one * 1e3)) for one in s)],
     "with a name and a remark": lambda s: ["timestamp", "# of the scanner", *(repr(float(one)) for one in s), ""],
 }
 
@@ -57,6 +58,13 @@ def test_the_times_are_those_of_the_rows(tmp_path, capfd, kind, form):
     time, said = converted(kind, tmp_path / "raw", tmp_path / "a.h5", capfd)
     np.testing.assert_allclose(time, SECONDS, atol=1e-3 if "milli" in form else 1e-5)
     assert "its frames have the times in timestamps.txt" in said and "left out" not in said
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_texts_of_windows_are_read(tmp_path, capfd, encoding):
+    write_frames(tmp_path, "clouds", range(6))
+    (tmp_path / "times.txt").write_text("\r\n".join(FORMS["seconds"](SECONDS)), encoding=encoding, newline="")
+    np.testing.assert_allclose(converted("clouds", tmp_path, tmp_path / "a.h5", capfd)[0], SECONDS, atol=1e-5)
 
 
 @pytest.mark.parametrize("first", [0, 1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -22,7 +24,11 @@ class ShapeGuidance:
         pictures, self.camera = reference_pictures(targets, side)
         self.name = prior.name
         self.layers = prior.layers(pictures, self.camera)
-        self.splats: list[Splats] = [splats_of(frame, self.camera) for frame in self.layers]
+
+    @cached_property
+    def splats(self) -> list[Splats]:
+        """Returns the Gaussians of every frame's layers."""
+        return [splats_of(frame, self.camera) for frame in self.layers]
 
     @property
     def confidence(self) -> float:
