@@ -11,6 +11,7 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
+from dpcli.prepare.decoded_text import decode_text
 from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.progress import log
 
@@ -71,8 +72,6 @@ def read_rows(path: Path, needed: str) -> dict[str, dict[str, str]]:
 
 def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
     """Returns the lines of a table that hold something, without comments above the header, with their numbers."""
-    from dpcli.prepare.cloud_formats.text_numbers import decode_text
-
     try:
         text = decode_text(path).lstrip("\ufeff")
         if told := _DIVIDER_TOLD.match(text):

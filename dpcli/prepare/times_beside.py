@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.text_numbers import decode_text
+from dpcli.prepare.decoded_text import decode_text
 from dpcli.prepare.scans.times_of_tables import clock_seconds, seconds_of
 from dpcli.prepare.series import Series, TimesBeside
 
