@@ -210,7 +210,7 @@ def test_one_signal_ends_a_wait_for_a_pipe(folder):
     )
     time.sleep(1.5)
     process.terminate()
-    _, told = process.communicate(timeout=20)
+    _, told = process.communicate(timeout=120)
     os.close(reading), os.close(writing)
     assert process.returncode == 75 and b"stopped by SIGTERM" in told
 
@@ -239,7 +239,7 @@ def test_a_second_signal_ends_it_at_once(folder):
     for letter in (b"x", b"y"):
         assert process.stdout.read(1) == letter
         process.terminate()
-    _, told = process.communicate(timeout=20)
+    _, told = process.communicate(timeout=120)
     assert process.returncode == 75 and told == b"dpc: error: stopped by SIGTERM; run the same command again\n"
 
 
@@ -282,7 +282,7 @@ def test_a_library_that_never_comes_back_or_crashes_ends_with_a_sentence(how, nu
         if number is not None:
             time.sleep(0.5)  # it is in the loop by then
             process.send_signal(number)
-        _, told = process.communicate(timeout=30)
+        _, told = process.communicate(timeout=120)
     finally:
         process.kill()  # a loop that nothing ends would take a core from all other tests
     assert process.returncode == code, told
@@ -300,7 +300,7 @@ def test_who_reads_a_pipe_does_not_wait_for_the_one_that_stands_by():
     )
     assert process.stdout.read() == b"x"  # the end of it
     assert process.poll() is None
-    process.communicate(timeout=30)
+    process.communicate(timeout=120)
     assert process.returncode == 0
 
 
@@ -325,7 +325,7 @@ finally:
 
 
 def test_what_ends_a_command_is_raised_again_where_a_library_drops_it_but_not_while_it_tidies_up():
-    done = subprocess.run([sys.executable, "-c", DROPPED], cwd=ROOT, capture_output=True, timeout=40)
+    done = subprocess.run([sys.executable, "-c", DROPPED], cwd=ROOT, capture_output=True, timeout=120)
     assert done.stdout == b"tidied" and done.stderr.count(b"signal_exit.Ended") == 1, done.stderr
 
 
