@@ -1,7 +1,8 @@
-"""Small text, JSON and TOML files of people and programs, read so that what is wrong with one is said with its name."""
+"""Text, JSON and TOML files of people and programs, read so that what is wrong with one is said with its name."""
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 import sys
@@ -15,6 +16,13 @@ _DEEPEST = 100  # lists and mappings in each other
 _TOO_DEEP = f"nested more than {_DEEPEST} deep, as no file of this kind is"
 _MOST_PLACES = 1000  # of one list
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
 
 
 def read_text(path: Path) -> str:
@@ -28,6 +36,23 @@ def read_text(path: Path) -> str:
         raise DataError(
             f"{path}: is not text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); save it as UTF-8"
         ) from None
+
+
+def decode_text(path: Path) -> str:
+    """Returns the text of a file in UTF-8, or in UTF-16 or 32 by its mark or its zeros; else byte by byte (Latin-1)."""
+    data = path.read_bytes()
+    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
+    if not encoding and b"\0" in data[:200].rstrip(b"\0"):  # zeros at the end are what a crash leaves
+        zeros = [data[:200][k::2].count(0) for k in (0, 1)]
+        if min(zeros) > 5 or max(zeros) < len(data[:200]) // 4:
+            raise DataError(f"{path}: not text; expected numbers in columns")
+        encoding = "utf-16-be" if zeros[0] > zeros[1] else "utf-16-le"
+    try:
+        return data.decode(encoding or "utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError:
+        if encoding:
+            raise DataError(f"{path}: not readable as {encoding}, perhaps truncated; save it as UTF-8") from None
+        return data.decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: Path) -> Any:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.decoded_text import decode_text
 from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.progress import log
+from dpcli.text_files import decode_text
 
 COLUMNS = ("name", "label", "subject", "split")
 _CALLED = {"file": "name", "filename": "name", "path": "name", "video": "name", "sample": "name"} | {

@@ -9,9 +9,9 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.decoded_text import decode_text
 from dpcli.prepare.scans.times_of_tables import clock_seconds, seconds_of
 from dpcli.prepare.series import Series, TimesBeside
+from dpcli.text_files import decode_text
 
 _STEMS = ("times", "timestamps", "time_stamps", "timestamp", "time")
 _SUFFIXES = (".txt", ".csv")

@@ -10,7 +10,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN, Cloud, cloud_of_columns, require_points
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
-from dpcli.prepare.decoded_text import decode_text
+from dpcli.text_files import decode_text
 
 _HEADER = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)  # numbers in the lines before a scan: columns, rows, scanner, axes, matrix
 _NAMES = "x y z intensity red green blue".split()

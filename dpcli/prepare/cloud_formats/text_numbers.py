@@ -16,7 +16,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
 from dpcli.prepare.cloud_formats.column_names import unit_of, unit_of_comments
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
-from dpcli.prepare.decoded_text import decode_text
+from dpcli.text_files import decode_text
 
 COMMENTS = ("#", "//", "%")
 _SHEET_ERRORS = ("#n/a", "#na", "#value!", "#div/0!", "#num!", "#ref!", "#null!", "#name?")  # of spreadsheets
