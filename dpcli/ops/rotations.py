@@ -96,6 +96,21 @@ def rotate_by_quaternion(
     return vector + 2 * (w * cross + torch.linalg.cross(axis, cross))
 
 
+def axis_rotation(
+    axis: np.ndarray,  # [3], unit
+    angles: np.ndarray,  # [F], radians
+) -> np.ndarray:  # [F, 3, 3]
+    """Returns the rotations about an axis, anticlockwise seen from its tip, by Rodrigues' formula.
+
+    >>> axis_rotation(np.array([0.0, 0.0, 1.0]), np.array([np.pi / 2])).round().tolist()
+    [[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
+    """
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
 def nearest_rotation(
     matrix: Array,  # [..., 3, 3]
 ) -> Array:  # [..., 3, 3]

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dpcli.ops.rotations import (
+    axis_rotation,
     mean_rotation,
     motion_matrix,
     multiply_quaternions,
@@ -73,3 +76,12 @@ def test_a_motion_s_matrix_moves_points(kind):
     moved = np.asarray(motion_matrix(kind(matrices), kind(shift))) @ np.append(points, np.ones((3, 1)), 1)[..., None]
     expected = np.einsum("nij,nj->ni", matrices, points) + shift
     np.testing.assert_allclose(moved[..., 0], np.append(expected, np.ones((3, 1)), 1), atol=1e-12)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1), st.floats(-4, 4))
+def test_axis_rotation_is_the_matrix_exponential(axis, angle):
+    from scipy.linalg import expm
+
+    x, y, z = axis = np.array(axis) / np.linalg.norm(axis)
+    expected = expm(angle * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    np.testing.assert_allclose(axis_rotation(axis, np.array([angle]))[0], expected, atol=1e-10)

@@ -65,6 +65,14 @@ class Augmentation:
         most=1,
         name="augment_warp",
     )
+    still: float = setting(
+        0.0,
+        "Share of the clips in which one frame is held, and which are to be like no class: a network learns to be unsure where"
+        " nobody moves. Not for data with a class of people who stand still; nothing with timing = slots.",
+        least=0,
+        below=1,
+        name="augment_still",
+    )
 
     def __post_init__(self) -> None:
         check(self)

@@ -137,12 +137,25 @@ class ClipSource:
         rng = generator(self.seed, ClassifyStream.CLIPS, number)
         if together and per_video:
             videos = [[self._random_clip(s, rng, k, per_video) for k in range(per_video)] for s in self.sequences]
-            return [clip for i in rng.permutation(len(videos)) for clip in videos[i]]
+            return [clip for i in rng.permutation(len(videos)) for clip in self._some_still(videos[i], rng)]
         if per_video is None and self.timing == "clips":
             clips = self.clips(None)
         else:
             clips = [self._random_clip(s, rng) for s in self.sequences for _ in range(per_video or 1)]
-        return [clips[i] for i in rng.permutation(len(clips))]
+        return [self._some_still([clips[i]], rng)[0] for i in rng.permutation(len(clips))]
+
+    def target(self, clip: Clip) -> int:
+        """Returns the number of the class that a clip should be taken for, -1 for none: a frame of a longer video, held."""
+        held = len(set(clip.frames)) == 1 < min(len(clip.frames), int(self.reader.frame_counts[clip.sequence]))
+        return -1 if held else int(self.reader.labels[clip.sequence])
+
+    def _some_still(self, clips: list[Clip], rng: np.random.Generator) -> list[Clip]:
+        """Returns a video's clips, for the share `still` of all draws with one of their frames held."""
+        if self.timing == "slots" or not self.augmentation.still or rng.random() >= self.augmentation.still:
+            return clips
+        return [
+            Clip(clip.sequence, (clip.frames[rng.integers(len(clip.frames))],) * len(clip.frames)) for clip in clips
+        ]
 
     def _random_clip(self, sequence: int, rng: np.random.Generator, part: int = 0, parts: int = 1) -> Clip:
         """Returns a clip that starts in one of the equal parts of all starts of a video."""

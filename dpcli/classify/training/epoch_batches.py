@@ -12,7 +12,9 @@ from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
 
-Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # points (b,T,P,3), labels (b), numbers of the clips (b)
+Batch = tuple[
+    torch.Tensor, torch.Tensor, torch.Tensor
+]  # points (b,T,P,3), labels (b), -1 for none; numbers of the clips (b)
 
 
 class _ClipDataset(torch.utils.data.Dataset):
@@ -27,7 +29,7 @@ class _ClipDataset(torch.utils.data.Dataset):
     def __getitem__(self, index: int) -> tuple[torch.Tensor, int, int]:
         clip = self.clips[index]
         points = torch.from_numpy(np.ascontiguousarray(self.source.load(clip, self.draw, index, 0), np.float32))
-        return points, int(self.source.reader.labels[clip.sequence]), self.first + index
+        return points, self.source.target(clip), self.first + index
 
 
 class EpochBatches:

@@ -66,8 +66,8 @@ class StageStep:
     def __call__(
         self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None
     ) -> tuple[float, int, bool]:
-        """Takes a step on points (b,T,P,3) with labels (b) at a learning rate; returns the sum of losses, how many are rightly
-        classified, and whether weights were changed.
+        """Takes a step on points (b,T,P,3) with labels (b), -1 for none, at a learning rate; returns the sum of losses, how
+        many are rightly classified, and whether weights were changed.
 
         clips i64 (b): numbers by which `neighbors` knows them.
         """
@@ -95,9 +95,7 @@ class StageStep:
             logits = self.module(points, *groups).float()
         together = self.schedule.clips_per_loss
         logits, labels = logits.unflatten(0, (-1, together)).mean(1), labels[::together]
-        loss = nn.functional.cross_entropy(
-            logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
-        )
+        loss = _loss(logits, labels, self.schedule.label_smoothing)
         loss = loss * together  # each clip of a video counts what the video does
         (loss / clips).backward()
         return float(loss.detach()), together * int((logits.argmax(-1) == labels).sum())
@@ -105,6 +103,17 @@ class StageStep:
     def _without_exchange(self, on: bool) -> contextlib.AbstractContextManager:
         """Keeps gradients to the process: they are exchanged once a step, not after its earlier parts."""
         return self.module.no_sync() if on and self.processes.count > 1 else contextlib.nullcontext()
+
+
+def _loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
+    """Returns the sum of cross entropies of logits (b,C) and labels (b); of no class, -1, is what is like all of them.
+
+    Lee et al., "Training Confidence-calibrated Classifiers for Detecting Out-of-Distribution Samples", ICLR 2018, without a
+    generator: equation 1's second term, on clips that are known to show no class.
+    """
+    none = labels < 0
+    loss = nn.functional.cross_entropy(logits, labels, label_smoothing=smoothing, reduction="sum", ignore_index=-1)
+    return loss - logits[none].log_softmax(-1).mean(-1).sum() if none.any() else loss
 
 
 def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -> nn.Module:

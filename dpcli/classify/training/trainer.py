@@ -51,7 +51,7 @@ class Trainer:
         self.processes = processes or Processes()
         self.stage, self.epoch, self.step = 0, 0, 0  # where the run is: stream, its epoch, batch within the epoch
         self.best = [-1.0, -1.0]  # validation accuracy of each stream
-        self.sums = [0.0, 0.0, 0.0]  # loss, correct, clips of the epoch so far
+        self.sums = [0.0, 0.0, 0.0, 0.0]  # of the epoch so far: loss, correct, clips, those of no class
         self.spent = 0.0  # seconds of the epoch before a stop
         self.optimize: StageStep | None = None
         self.watch = watch_of(info.config.num_classes)
@@ -121,7 +121,7 @@ class Trainer:
         for batch in self._load(data):
             rate = learning_rate(self.schedule, self.stage, done + self.step, steps)
             stopping = self._take(*batch, rate)
-            loss, accuracy = self.sums[0] / self.sums[2], self.sums[1] / self.sums[2]
+            loss, accuracy = self._means()
             bar.note(epoch=f"{self.epoch + 1}/{epochs}", loss=loss, accuracy=accuracy)
             bar.advance(self.schedule.batch)
             if stopping:
@@ -147,14 +147,19 @@ class Trainer:
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
         torch.manual_seed(torch_seed(*where))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)
-        shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
-        loss, correct, count, stopping = self.processes.sums(shares, self.device)
-        problem = self.watch.see(loss / count, stepped)
+        shares = (loss, correct, len(labels), int((labels < 0).sum()), self.stop.requested)
+        *sums, stopping = self.processes.sums(tuple(map(float, shares)), self.device)
+        problem = self.watch.see(sums[0] / sums[2], stepped)
         if problem:
             raise DpcError(self._divergence(problem, rate))
-        self.sums = [before + new for before, new in zip(self.sums, (loss, correct, count))]
+        self.sums = [before + new for before, new in zip(self.sums, sums)]
         self.step += 1
         return stopping > 0
+
+    def _means(self) -> tuple[float, float]:
+        """Returns the mean loss of the epoch's clips so far, and the share of those with a class that is right."""
+        loss, correct, clips, none = self.sums
+        return loss / clips, correct / max(clips - none, 1)
 
     def _divergence(self, problem: str, rate: float) -> str:
         """Returns the sentences about a run whose loss or weights ran away."""
@@ -183,16 +188,17 @@ class Trainer:
         last = self.epoch + 1 == self.schedule.stage_epochs[self.stage]
         if self.validation is not None and (last or (self.epoch + 1) % self.schedule.validate_every == 0):
             accuracy = self.validate()[STREAMS[self.stage]]
+        loss, train_accuracy = self._means()
         row = {
             "stage": STREAMS[self.stage],
             "epoch": self.epoch + 1,
-            "loss": self.sums[0] / self.sums[2],
+            "loss": loss,
             "learning_rate": rate,
-            "train_accuracy": self.sums[1] / self.sums[2],
+            "train_accuracy": train_accuracy,
             "validation_accuracy": accuracy,
             "seconds": round(self.spent + time.monotonic() - started, 2),
         }
-        self.epoch, self.step, self.sums, self.spent = self.epoch + 1, 0, [0.0, 0.0, 0.0], 0.0
+        self.epoch, self.step, self.sums, self.spent = self.epoch + 1, 0, [0.0] * 4, 0.0
         if accuracy is not None and accuracy >= self.best[self.stage]:
             self.best[self.stage] = accuracy
             self._save_model("best.safetensors")

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.ops.rotations import axis_rotation
 from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
 
 _NEGLIGIBLE = 1e-3  # of the object's diameter: what moves by less doesn't move
@@ -105,14 +106,6 @@ def joint_motion(joint: Joint, values: np.ndarray) -> np.ndarray:
     else:
         motion[:, :3, :3] = axis_rotation(joint.axis, values)
     return motion
-
-
-def axis_rotation(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Returns rotations by ``angles`` f64 (F), radians, about the unit vector ``axis`` (3) -> f64 (F,3,3)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
 
 
 def transform(motions: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.ops.rotations import quaternion_to_matrix
+from dpcli.ops.rotations import axis_rotation, quaternion_to_matrix
 from dpcli.prepare.articulated.articulated_object import (
     ArticulatedObject,
-    axis_rotation,
     finite_limits,
     idle_joints,
     lock_small,

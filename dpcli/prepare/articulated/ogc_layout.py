@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.articulated_object import axis_rotation
+from dpcli.ops.rotations import axis_rotation
 
 GROUND = -0.49  # y of the floor; x and z are centered; the room is 1 wide
 _TRIES = 40  # places or motions drawn for one object before the room is begun anew

@@ -118,12 +118,12 @@ class AnimatedMesh:
 
 
 def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, float]:
-    """Returns center f64 (3) and radius of a small ball that holds points (N,3).
+    """Returns center f64 (3) and radius of a small ball that holds all points (...,3).
 
     Badoiu and Clarkson (2003): step i moves the center by 1/(i+1) toward the farthest point; within 1/sqrt(steps)
     of the smallest ball. Started at the middle of the box, it ends far closer than that.
     """
-    points = np.asarray(points, np.float64)
+    points = np.asarray(points, np.float64).reshape(-1, 3)
     outer = _extreme(points)
     center = (outer.min(0) + outer.max(0)) / 2
     for step in range(steps):

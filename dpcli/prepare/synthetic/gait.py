@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.prepare.articulated.articulated_object import axis_rotation
+from dpcli.ops.rotations import axis_rotation
 from dpcli.prepare.synthetic.creature import Creature
 
 X, Y, Z = np.eye(3)

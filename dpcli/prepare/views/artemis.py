@@ -14,6 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import read_rgba
+from dpcli.prepare.meshes.animated_mesh import bounding_sphere
 from dpcli.prepare.views.artemis_files import (
     Motion,
     Skin,
@@ -27,7 +28,7 @@ from dpcli.prepare.views.artemis_files import (
 )
 from dpcli.prepare.views.masks import read_mask
 from dpcli.prepare.views.matting import clear_invisible
-from dpcli.prepare.views.orbit_world import bounding_sphere, into_orbit, sphere_of_silhouettes, up_direction
+from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_direction
 from dpcli.prepare.views.square_crop import Box, crop_around, touches_border, union, visible_box
 from dpcli.prepare.views.video import spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of

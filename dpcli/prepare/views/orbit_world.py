@@ -103,20 +103,6 @@ def into_orbit(up: np.ndarray, reference: np.ndarray, center: np.ndarray, radius
     )
 
 
-def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, float]:
-    """Returns center f64 (3) and radius of a sphere that holds all points (...,3), nearly the smallest one.
-
-    Steps of 1/(i+1) toward the farthest point (Badoiu and Clarkson 2003): within a percent of the smallest radius,
-    and turned points give the turned sphere. The radius is exact for the center.
-    """
-    flat = np.asarray(points, np.float64).reshape(-1, 3)
-    center = flat.mean(axis=0)
-    for step in range(1, steps + 1):
-        farthest = flat[((flat - center) ** 2).sum(axis=1).argmax()]
-        center = center + (farthest - center) / (step + 1)
-    return center, float(np.sqrt(((flat - center) ** 2).sum(axis=1).max()))
-
-
 def _require_places(poses: np.ndarray) -> None:
     """Raises DataError for cameras that stand in one place and are turned differently, as those of inverted poses do."""
     centers, turned = camera_centers(poses), poses[:, :3, :3] @ poses[0, :3, :3].T

@@ -12,6 +12,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from dpcli.ops.rotations import axis_rotation
+
 _GOLDEN = (1 + 5**0.5) / 2
 _CLOSE = 1e-6  # rotations of the group differ by 0.6 and more in some entry, rounding by 1e-15
 
@@ -54,14 +56,6 @@ def vertices() -> np.ndarray:
     return np.array(cyclic) / np.hypot(1, _GOLDEN)
 
 
-def rotation_about(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """Returns the rotation matrix f64 (3,3) about an axis, anticlockwise seen from its tip (Rodrigues)."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
 def _faces() -> np.ndarray:
     """Returns the centers of the 20 faces, unit vectors: every three vertices that touch one another."""
     points = vertices()
@@ -92,7 +86,7 @@ def icosahedral_group() -> RotationGroup:
     """
     faces, points = _faces(), vertices()
     face = faces[np.argmax(faces @ points[0])]
-    turns = [rotation_about(points[0], 72), rotation_about(face, 120)]
+    turns = [axis_rotation(axis, np.radians([turn]))[0] for axis, turn in ((points[0], 72), (face, 120))]
     rotations = [np.eye(3)]
     for element in rotations:  # grows while we walk it, until no product is new
         for turn in turns:

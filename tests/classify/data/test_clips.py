@@ -361,6 +361,29 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
     assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
 
 
+@pytest.mark.parametrize("timing,per_video", [("clips", None), ("clips", 4), ("uniform", 4)])
+@pytest.mark.parametrize("together", [False, True])
+def test_some_clips_hold_a_frame_and_are_of_no_class(reader, timing, per_video, together):
+    source = ClipSource(reader, [1, 2, 3], CONFIG, timing=timing, augmentation=Augmentation(still=0.3), seed=5)
+    drawn = [source.epoch(number, per_video, together) for number in range(60)]
+    held = [clip for clips in drawn for clip in clips if len(set(clip.frames)) == 1]
+    assert 0.24 < len(held) / sum(map(len, drawn)) < 0.36
+    assert {clip.sequence for clip in held} == {1, 2, 3}
+    assert {clip.frames[0] for clip in held if clip.sequence == 3} == set(range(10))  # any frame of the video
+    for clip in drawn[0]:
+        assert source.target(clip) == (-1 if clip in held else reader.labels[clip.sequence])
+    if together and per_video:  # the clips of a video are judged together: all or none of them
+        kinds = [[len(set(clip.frames)) == 1 for clip in clips] for clips in drawn]
+        assert all(len(set(some[i : i + 4])) == 1 for some in kinds for i in (0, 4, 8))
+
+
+def test_a_video_of_one_frame_has_its_class(tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a", "b"]) as writer:
+        writer.write(CloudSequence.from_frames("v", [np.zeros((5, 3), np.float32)], label=1, split="train"))
+    source = ClipSource(CloudsReader(tmp_path / "c.h5"), [0], CONFIG, augmentation=Augmentation(still=0.5))
+    assert {source.target(clip) for number in range(20) for clip in source.epoch(number, 1)} == {1}
+
+
 def test_an_augmentation_is_one_by_name_and_changes():
     """The name sets all ranges, and each may then be changed; the preset's holds where nothing is said."""
 

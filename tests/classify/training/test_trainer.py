@@ -190,6 +190,19 @@ def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
     assert json.loads((alone / "config.json").read_text())["schedule"]["label_smoothing"] == 0.05
 
 
+def test_the_loss_of_no_class_is_that_against_equal_shares_of_all():
+    torch.manual_seed(0)
+    model = Kinet(network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3)).eval()
+    points, labels = torch.randn(4, 2, 64, 3) * 0.3, torch.tensor([0, -1, 2, -1])
+    with torch.no_grad():
+        logits = model.static_logits(points)
+    shares = torch.tensor([[0.8, 0.1, 0.1], [1 / 3] * 3, [0.1, 0.1, 0.8], [1 / 3] * 3])
+    step = StageStep(model, 0, Schedule(1, 1, batch=4, label_smoothing=0.3), torch.device("cpu"), Processes())
+    total, right, stepped = step(points, labels, 1e-3)
+    assert stepped and right == int((logits.argmax(-1) == labels).sum())
+    assert total == pytest.approx(-float((shares * logits.log_softmax(-1)).sum()), rel=1e-5)
+
+
 @pytest.mark.parametrize("backend", ["torch", "numba"])  # the GPU's path, on this CPU; and --amp on a CPU
 @pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn"])
 def test_mixed_precision_trains_both_streams_near_float32(backbone, backend, monkeypatch):

@@ -10,14 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.articulated.articulated_object import (
-    axis_rotation,
-    joint_motion,
-    lock_some,
-    parts,
-    sample_values,
-    transform,
-)
+from dpcli.prepare.articulated.articulated_object import joint_motion, lock_some, parts, sample_values, transform
 from dpcli.prepare.articulated.articulated_sequence import (
     Articulation,
     draw_sequence,
@@ -101,15 +94,6 @@ def test_forward_kinematics_against_another_library(tmp_path):
             np.testing.assert_allclose(poses[body], robot.get_transform(name), atol=1e-10)
         both = [robot.get_transform(name)[:3, 3] for name in ("l2", "l3")]  # one body of two welded boxes
         np.testing.assert_allclose(transform(poses[3], corners[3]), np.mean(both, axis=0), atol=1e-10)
-
-
-@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1), st.floats(-4, 4))
-def test_axis_rotation_is_the_matrix_exponential(axis, angle):
-    from scipy.linalg import expm
-
-    x, y, z = axis = np.array(axis) / np.linalg.norm(axis)
-    expected = expm(angle * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
-    np.testing.assert_allclose(axis_rotation(axis, np.array([angle]))[0], expected, atol=1e-10)
 
 
 def draw(obj, seed=0, pad=1, **options):

@@ -275,6 +275,17 @@ def test_the_bounding_ball():
     assert bounding_sphere(corners)[1] == pytest.approx(np.sqrt(3), rel=1e-6)
 
 
+def test_the_bounding_ball_of_a_lopsided_cloud_is_nearly_the_smallest():
+    rng = np.random.default_rng(0)
+    inside = rng.normal(size=(500, 3))
+    inside *= rng.random((500, 1)) ** (1 / 3) / np.linalg.norm(inside, axis=1, keepdims=True)
+    pole = np.array([[0, 0.6, 0.8]])
+    points = np.concatenate([inside[inside @ pole[0] > -0.2], pole, -pole])  # lopsided, yet the poles fix the sphere
+    center, radius = bounding_sphere(3 * points + [1, 2, 3])
+    assert 3 - 1e-9 <= radius < 3.03 and np.linalg.norm(center - [1, 2, 3]) < 0.05
+    assert (np.linalg.norm(3 * points + [1, 2, 3] - center, axis=1) <= radius + 1e-12).all()
+
+
 def test_objects_fill_the_same_ball_whatever_their_size(tmp_path):
     mesh = load_animation(arm().write(tmp_path / "arm.glb"), None, 8)
     for scale in (1e-3, 1.0, 50.0):

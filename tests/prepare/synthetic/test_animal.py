@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from dpcli.errors import UsageError
-from dpcli.prepare.articulated.articulated_object import axis_rotation
+from dpcli.ops.rotations import axis_rotation
 from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, track_points
 from dpcli.prepare.synthetic import creature
 from dpcli.prepare.synthetic.animal import make_animal

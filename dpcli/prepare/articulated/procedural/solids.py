@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, axis_rotation, drop_degenerate
+from dpcli.ops.rotations import axis_rotation
+from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, drop_degenerate
 
 X, Y, Z = np.eye(3)
 
