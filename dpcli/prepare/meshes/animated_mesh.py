@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from dpcli.prepare.bounding_sphere import bounding_sphere
+
 SHRUNK = 0.01  # of the largest reach in the clip: what is smaller shows nothing
 
 
@@ -117,21 +119,6 @@ class AnimatedMesh:
         return replace(self, positions=positions.astype(np.float32), normals=normals, bone_pose=pose)
 
 
-def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, float]:
-    """Returns center f64 (3) and radius of a small ball that holds all points (...,3).
-
-    Badoiu and Clarkson (2003): step i moves the center by 1/(i+1) toward the farthest point; within 1/sqrt(steps)
-    of the smallest ball. Started at the middle of the box, it ends far closer than that.
-    """
-    points = np.asarray(points, np.float64).reshape(-1, 3)
-    outer = _extreme(points)
-    center = (outer.min(0) + outer.max(0)) / 2
-    for step in range(steps):
-        farthest = outer[((outer - center) ** 2).sum(1).argmax()]
-        center = center + (farthest - center) / (step + 5)
-    return center, float(np.sqrt(((points - center) ** 2).sum(1).max()))
-
-
 def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool = True) -> AnimatedMesh:
     """Returns the mesh in a ball of this radius around the origin, over all frames together; what is hidden doesn't count.
 
@@ -154,15 +141,3 @@ def _middles(positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
     filled = np.flatnonzero(seen.any(1))
     means = np.stack([positions[frame, seen[frame]].mean(0, dtype=np.float64) for frame in filled])
     return means[np.clip(np.searchsorted(filled, np.arange(len(seen)), side="right") - 1, 0, None)]
-
-
-def _extreme(points: np.ndarray, directions: int = 512) -> np.ndarray:
-    """Returns the points that can touch a bounding ball, nearly: the farthest in each of many directions; millions are
-    slow.
-    """
-    if len(points) < 2_000:
-        return points
-    k = np.arange(directions) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * k / directions), np.pi * (1 + 5**0.5) * k  # a Fibonacci lattice on the sphere
-    lattice = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
-    return points[np.unique([(points @ direction).argmax() for direction in lattice.T.astype(points.dtype)])]

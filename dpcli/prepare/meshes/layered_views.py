@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from dpcli.ops.cameras import orbit_pose
-from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, bounding_sphere
+from dpcli.prepare.bounding_sphere import bounding_sphere
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf_material import to_srgb
 from dpcli.prepare.meshes.raycast import emitted, light_on, surface_color
 

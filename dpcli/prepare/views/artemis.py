@@ -13,8 +13,8 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
+from dpcli.prepare.bounding_sphere import bounding_sphere
 from dpcli.prepare.decode.color_frames import read_rgba
-from dpcli.prepare.meshes.animated_mesh import bounding_sphere
 from dpcli.prepare.views.artemis_files import (
     Motion,
     Skin,

@@ -15,7 +15,7 @@ from dpcli.cli.prepare.views.animation import animation
 from dpcli.cli.prepare.views.filming import FilmingOptions
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_pose, pinhole
-from dpcli.prepare.meshes.animated_mesh import Material, Texture, bounding_sphere, normalized
+from dpcli.prepare.meshes.animated_mesh import Material, Texture, normalized
 from dpcli.prepare.meshes.animation import animation_clip, list_clips, load_animation
 from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, motion_distance, rigid_parts, track_points
 from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film
@@ -262,28 +262,6 @@ def test_textures_beyond_their_edge(wrap, expected):
     assert between == pytest.approx((light[0] + light[1]) / 2, rel=1e-5)
     moved = Texture(pixels, (wrap, "repeat"), np.array([[0.5, 0, 0.25], [0, 1, 0]]))
     assert sample_texture(moved, np.array([[0.25, 0.5]]))[0, 0] == pytest.approx(light[1], rel=1e-5)  # 0.25 -> 0.375
-
-
-def test_the_bounding_ball():
-    rng = np.random.default_rng(4)
-    points = rng.normal(size=(30_000, 3))
-    points *= (rng.uniform(0, 1, 30_000) ** (1 / 3) / np.linalg.norm(points, axis=1))[:, None]
-    center, radius = bounding_sphere(3 * points + [1, 2, 3])
-    assert np.linalg.norm(3 * points + [1, 2, 3] - center, axis=1).max() <= radius + 1e-9
-    assert radius < 3.03
-    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
-    assert bounding_sphere(corners)[1] == pytest.approx(np.sqrt(3), rel=1e-6)
-
-
-def test_the_bounding_ball_of_a_lopsided_cloud_is_nearly_the_smallest():
-    rng = np.random.default_rng(0)
-    inside = rng.normal(size=(500, 3))
-    inside *= rng.random((500, 1)) ** (1 / 3) / np.linalg.norm(inside, axis=1, keepdims=True)
-    pole = np.array([[0, 0.6, 0.8]])
-    points = np.concatenate([inside[inside @ pole[0] > -0.2], pole, -pole])  # lopsided, yet the poles fix the sphere
-    center, radius = bounding_sphere(3 * points + [1, 2, 3])
-    assert 3 - 1e-9 <= radius < 3.03 and np.linalg.norm(center - [1, 2, 3]) < 0.05
-    assert (np.linalg.norm(3 * points + [1, 2, 3] - center, axis=1) <= radius + 1e-12).all()
 
 
 def test_objects_fill_the_same_ball_whatever_their_size(tmp_path):

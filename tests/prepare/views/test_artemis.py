@@ -11,7 +11,7 @@ from PIL import Image
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
-from dpcli.prepare.meshes.animated_mesh import bounding_sphere
+from dpcli.prepare.bounding_sphere import bounding_sphere
 from dpcli.prepare.views.artemis import ArtemisOptions, artemis_clip, nearest_azimuths
 from dpcli.prepare.views.artemis_files import Skin, outer_shell, read_intrinsics, read_poses
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_direction
