@@ -18,10 +18,14 @@ from dpcli.store.schema import kept_name
 
 @dataclass(frozen=True)
 class Clip:
-    """Names frames of one sequence by number; a number repeats where a short video is padded."""
+    """Names frames of one sequence by number; a number repeats where a short video is padded.
+
+    held: one of the video's frames takes the place of all, so that nobody moves and the clip shows no class.
+    """
 
     sequence: int
     frames: tuple[int, ...]
+    held: bool = False
 
 
 def clip_starts(length: int, frames: int, count: int | None) -> list[int]:
@@ -145,17 +149,21 @@ class ClipSource:
         return [self._some_still([clips[i]], rng)[0] for i in rng.permutation(len(clips))]
 
     def target(self, clip: Clip) -> int:
-        """Returns the number of the class that a clip should be taken for, -1 for none: a frame of a longer video, held."""
-        held = len(set(clip.frames)) == 1 < min(len(clip.frames), int(self.reader.frame_counts[clip.sequence]))
-        return -1 if held else int(self.reader.labels[clip.sequence])
+        """Returns the number of the class that a clip should be taken for, -1 for none."""
+        return -1 if clip.held else int(self.reader.labels[clip.sequence])
 
     def _some_still(self, clips: list[Clip], rng: np.random.Generator) -> list[Clip]:
-        """Returns a video's clips, for the share `still` of all draws with one of their frames held."""
-        if self.timing == "slots" or not self.augmentation.still or rng.random() >= self.augmentation.still:
+        """Returns a video's clips, for the share `still` of all draws with one of their frames held; a single frame stays."""
+        frames = min(self.config.num_frames, int(self.reader.frame_counts[clips[0].sequence]))
+        if (
+            self.timing == "slots"
+            or frames < 2
+            or not self.augmentation.still
+            or rng.random() >= self.augmentation.still
+        ):
             return clips
-        return [
-            Clip(clip.sequence, (clip.frames[rng.integers(len(clip.frames))],) * len(clip.frames)) for clip in clips
-        ]
+        shown = [(clip.sequence, clip.frames[rng.integers(len(clip.frames))]) for clip in clips]
+        return [Clip(sequence, (frame,) * self.config.num_frames, held=True) for sequence, frame in shown]
 
     def _random_clip(self, sequence: int, rng: np.random.Generator, part: int = 0, parts: int = 1) -> Clip:
         """Returns a clip that starts in one of the equal parts of all starts of a video."""

@@ -12,9 +12,8 @@ from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
 
-Batch = tuple[
-    torch.Tensor, torch.Tensor, torch.Tensor
-]  # points (b,T,P,3), labels (b), -1 for none; numbers of the clips (b)
+# Points (b,T,P,3), labels (b), -1 for none, and numbers of the clips (b).
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class _ClipDataset(torch.utils.data.Dataset):

@@ -47,7 +47,7 @@ def _simplest(frames: Frames, body: Body, inside: np.ndarray, parents: list[tupl
     for mask, parent in parents:
         starts = _first_joints(frames, body.trajectory, inside, parent)
         at_contact = contact_hinge(*(_at_rest(frames, own, parent) for own in (inside, mask)), frames.spacing)
-        for start in [*starts, at_contact][: None if at_contact else -1]:
+        for start in [*starts, at_contact] if at_contact else starts:
             tried.append(body_of(frames, PointFit(frames, inside, parent, start).run(_STEPS, _WIDE).trajectory))
             price = _AT_CONTACT * (start is at_contact)
             numbers.append(values + price + (4 if start.kind == REVOLUTE else 2))

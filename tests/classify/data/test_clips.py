@@ -366,7 +366,8 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
 def test_some_clips_hold_a_frame_and_are_of_no_class(reader, timing, per_video, together):
     source = ClipSource(reader, [1, 2, 3], CONFIG, timing=timing, augmentation=Augmentation(still=0.3), seed=5)
     drawn = [source.epoch(number, per_video, together) for number in range(60)]
-    held = [clip for clips in drawn for clip in clips if len(set(clip.frames)) == 1]
+    held = [clip for clips in drawn for clip in clips if clip.held]
+    assert all(len(set(clip.frames)) == 1 for clip in held)
     assert 0.24 < len(held) / sum(map(len, drawn)) < 0.36
     assert {clip.sequence for clip in held} == {1, 2, 3}
     assert {clip.frames[0] for clip in held if clip.sequence == 3} == set(range(10))  # any frame of the video
@@ -382,6 +383,14 @@ def test_a_video_of_one_frame_has_its_class(tmp_path):
         writer.write(CloudSequence.from_frames("v", [np.zeros((5, 3), np.float32)], label=1, split="train"))
     source = ClipSource(CloudsReader(tmp_path / "c.h5"), [0], CONFIG, augmentation=Augmentation(still=0.5))
     assert {source.target(clip) for number in range(20) for clip in source.epoch(number, 1)} == {1}
+
+
+def test_a_slow_clip_of_one_frame_keeps_its_class(reader):
+    config, slow = replace(CONFIG, num_frames=2), Augmentation(speed=3.0)
+    source = ClipSource(reader, [3], config, augmentation=slow)
+    drawn = [clip for number in range(40) for clip in source.epoch(number, 1)]
+    assert any(len(set(clip.frames)) == 1 for clip in drawn)
+    assert {source.target(clip) for clip in drawn} == {reader.labels[3]}
 
 
 def test_an_augmentation_is_one_by_name_and_changes():
