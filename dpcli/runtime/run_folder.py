@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -93,6 +94,10 @@ class RunFolder:
         self.columns, self.curves = tuple(columns), curves
         self.path, self.config, self.force = Path(path), config, force
         self.rows: list[dict] = []
+        self._drawn, self._draw_again = (
+            0,
+            0.0,
+        )  # rows that the picture shows; when it may be drawn next, by time.monotonic
         self._lock = -1
         if self.path.exists() and not self.path.is_dir():
             raise UsageError(f"{self.path}: is a file; -o of train names a folder")
@@ -119,7 +124,18 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._release()
+        try:
+            if not isinstance(error, (OSError, DiskFull)):
+                self._draw_rest()
+        except (OSError, DiskFull) as problem:
+            self._tell_full(problem)
+            raise
+        finally:
+            self._release()
+        self._tell_full(error)
+
+    def _tell_full(self, error: BaseException | None) -> None:
+        """Raises DiskFull, with what becomes of the run, where that is what an error means."""
         full = disk_full(Path(error.filename or self.path), error) if isinstance(error, OSError) else error
         if isinstance(full, DiskFull):
             saved = ": it continues from the last saved state" if (self.path / "state.pt").exists() else ""
@@ -210,9 +226,16 @@ class RunFolder:
         _replace(self.path / "settings.toml", text)
 
     def draw_curves(self) -> None:
-        """Draws the learning curves so far, by the function given."""
-        if self.rows and self.curves is not None:
+        """Draws the learning curves so far, by the function given, for at most a twentieth of the time; the end draws the rest."""
+        if time.monotonic() >= self._draw_again:
+            self._draw_rest()
+
+    def _draw_rest(self) -> None:
+        if self.curves is not None and len(self.rows) > self._drawn:
+            started = time.monotonic()
             self.curves(self.rows, self.path / "curves.png")
+            self._drawn, now = len(self.rows), time.monotonic()
+            self._draw_again = now + 20 * (now - started)
 
 
 def _replace(path: Path, text: str) -> None:

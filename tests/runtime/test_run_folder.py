@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -15,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from dpcli.errors import DpcError, Stopped
+from dpcli.runtime.run_folder import RunFolder
 from dpcli.store import ScoresReader
 from dpcli.store.file import open_store
 from tests.classify.commands.test_train_predict import gestures
@@ -193,3 +196,22 @@ def test_the_largest_seed_trains_and_is_kept_in_files(data, tmp_path, dpc_here):
         assert int(file.attrs["seed"]) == largest
     above = dpc_here("classify", "predict", data, "--model", run, "-o", tmp_path / "t.h5", "--seed", largest + 1)
     assert above.returncode == 2 and b"--seed" in above.stderr and str(largest).encode() in above.stderr
+
+
+@pytest.mark.parametrize("error", [None, Stopped("saved"), OSError(28, "No space left on device")])
+def test_curves_take_little_of_the_time_and_show_all_rows_in_the_end(tmp_path, error):
+    drawn: list[int] = []
+
+    def curves(rows: list[dict], path: Path) -> None:
+        time.sleep(0.05)
+        drawn.append(len(rows))
+
+    with pytest.raises(DpcError) if error else contextlib.nullcontext():
+        with RunFolder(tmp_path / "run", {}, columns=["step"], curves=curves) as folder:
+            for step in range(10):
+                folder.log({"step": step})
+                folder.draw_curves()
+            if error:
+                raise error
+    assert drawn[0] == 1 and len(drawn) <= 5
+    assert drawn[-1] == 10 or isinstance(error, OSError)
