@@ -31,7 +31,7 @@ _HOPS_IN_WINDOW = 4  # predictions that see a frame, by default
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """Says how recordings are cut: hop and shortest in frames, None: a quarter and half of the window; the rest as in a stream."""
+    """Says how recordings are cut: hop and shortest in frames, None: a quarter of the window and all of it; the rest as in a stream."""
 
     hop: int | None = None
     window: int | None = None
@@ -88,7 +88,7 @@ def _cutting(info: ModelInfo, options: SegmentOptions, model: str) -> Cutting:
         raise UsageError(
             f"--hop {hop}: the window has {window} frames, and those between two windows would never be seen"
         )
-    shortest = window // 2 if options.shortest is None else options.shortest
+    shortest = window if options.shortest is None else options.shortest
     if shortest < 1:
         raise UsageError(f"--shortest {shortest}: expected at least 1 frame")
     return Cutting(window, hop, shortest, choose_confidence(info.notes, options.reject_below, model))

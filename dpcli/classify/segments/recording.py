@@ -15,7 +15,7 @@ from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.schema import kept_name
 from dpcli.store.tables.segments import Segment
 
-CHANGE = 0.3  # cost of a change of class, in nats of one whole window's evidence
+_CHANGE = 0.3  # what a change of class costs, in windows of full certainty; docs/experiments/classify.md, 2026-11-28
 _BLOCK = 256  # frames of a recording in memory at a time
 
 
@@ -78,7 +78,8 @@ def cut(found: WindowScores, class_names: Sequence[str], how: Cutting) -> list[S
     nothing = np.log(how.confidence.threshold) if how.confidence.threshold > 0 else -np.inf
     evidence = np.column_stack([evidence, np.full(len(evidence), nothing)])
     least = max(1, round(how.shortest / how.hop))
-    path = best_path(evidence * min(1.0, how.hop / how.window), least, CHANGE)
+    certain = -np.log(max(how.confidence.threshold, 1 / len(class_names)))  # what chance has, where nothing is rejected
+    path = best_path(evidence * min(1.0, how.hop / how.window), least, _CHANGE * certain)
     return [_segment(found, probabilities, class_names, how, *run, int(path[run[0]])) for run in runs(path)]
 
 

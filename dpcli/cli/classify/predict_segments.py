@@ -28,7 +28,7 @@ class SegmentOptions:
             "--shortest",
             min=1,
             rich_help_panel=PANEL,
-            help="With --segments: least number of frames of an action. Default: half a window.",
+            help="With --segments: least number of frames of an action. Default: a window.",
         ),
     ] = None
 

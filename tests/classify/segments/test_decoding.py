@@ -69,6 +69,16 @@ def test_what_is_unsure_is_nothing_and_a_flicker_is_smoothed():
     assert made[0].confidence == pytest.approx(0.99, abs=0.01) and made[1].confidence == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.9, 0.99])
+def test_an_action_between_pauses_is_found_whatever_the_threshold(threshold):
+    how = Cutting(window=8, hop=2, shortest=8, confidence=Confidence(threshold=threshold))
+    scores = np.full((22, 10), 0.1, np.float32)  # below every threshold
+    scores[8:14] = np.eye(10)[0]
+    found = WindowScores(7 + 2 * np.arange(22), scores, 50)
+    made = cut(found, list("abcdefghij"), how)
+    assert [one.name for one in made] == ["", "a", ""]
+
+
 def test_one_window_is_one_segment():
     how = Cutting(window=8, hop=4, shortest=100, confidence=Confidence())
     assert [(one.start, one.end, one.name) for one in cut(windows([1]), ["a", "b"], how)] == [(0, 10, "b")]
