@@ -111,6 +111,32 @@ def axis_rotation(
     return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
 
 
+def rotation_matrix(
+    vector: np.ndarray,  # [..., 3]
+) -> np.ndarray:  # [..., 3, 3]
+    """Returns the rotations by rotation vectors: about each one's direction, by its length in radians.
+
+    >>> rotation_matrix(np.array([0.0, 0.0, np.pi / 2])).round().tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix().reshape(*vector.shape, 3)
+
+
+def rotation_vector(
+    matrix: np.ndarray,  # [..., 3, 3]
+) -> np.ndarray:  # [..., 3]
+    """Returns the rotation vectors, at most pi long, of rotations (or of the rotations nearest to matrices).
+
+    >>> rotation_vector(rotation_matrix(np.array([0.1, 0.2, 0.3]))).round(6).tolist()
+    [0.1, 0.2, 0.3]
+    """
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-1])
+
+
 def nearest_rotation(
     matrix: Array,  # [..., 3, 3]
 ) -> Array:  # [..., 3, 3]

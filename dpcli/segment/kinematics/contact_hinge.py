@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from dpcli.ops.rotations import axis_rotation
 from dpcli.segment.kinematics.joint_fit import JointFit
 from dpcli.store.joints import REVOLUTE
 
@@ -76,7 +76,7 @@ def _best_angle(
     best = 0.0
     for angles in _ANGLES:
         tried = best + angles
-        misfit = _misfits(first, other, Rotation.from_rotvec(tried[:, None] * axis).as_matrix(), point, scale)
+        misfit = _misfits(first, other, axis_rotation(axis, tried), point, scale)
         best = float(tried[misfit.argmin()])
     return best, float(misfit.min())
 

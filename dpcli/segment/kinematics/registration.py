@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from dpcli.ops.rotations import motion_matrix, rotation_matrix, rotation_vector
 from dpcli.segment.flow.surface_icp import Surface, columns
 
 _SAMPLES = 12  # halves of the points that are registered anew
@@ -78,17 +78,15 @@ def _some(points: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray
 
 
 def twist_motion(twist: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Returns the motion f64 (4,4) that turns by the rotation vector twist[:3] about a center and shifts by twist[3:]."""
-    motion = np.eye(4)
-    motion[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
-    motion[:3, 3] = center + twist[3:] - motion[:3, :3] @ center
-    return motion
+    """Returns the motions f64 (...,4,4) that turn by the rotation vectors twist[...,:3] about a center and shift by twist[...,3:]."""
+    turn = rotation_matrix(twist[..., :3])
+    return motion_matrix(turn, center + twist[..., 3:] - turn @ center)
 
 
 def motion_twist(motion: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Returns the twists f64 (T,6) of `twist_motion` that motions (T,4,4) or (T,3,4) make."""
-    turn = motion[:, :3, :3]
-    return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), turn @ center + motion[:, :3, 3] - center], 1)
+    """Returns the twists f64 (...,6) of `twist_motion` that motions (...,4,4) or (...,3,4) make."""
+    turn = motion[..., :3, :3]
+    return np.concatenate([rotation_vector(turn), turn @ center + motion[..., :3, 3] - center], -1)
 
 
 def relative_registration(parent: Registration, child: Registration) -> Registration:

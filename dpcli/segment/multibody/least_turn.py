@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from dpcli.ops.rotations import rotation_matrix, rotation_vector
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
 from dpcli.segment.multibody.frames import Frames, Trajectory, compose, move, relative_motion
 
@@ -66,7 +66,7 @@ def _turned_back(
         wanted = move(compose(relative_motion(reference, u - 1, u), new[u - 1]), own)
         seen = (wanted - trajectory[u, :, 3]) @ trajectory[u, :, :3] - center
         angle = np.arctan2((np.cross(arm, seen) @ axis).sum(), (arm * seen).sum())
-        turn = Rotation.from_rotvec(angle * axis).as_matrix()
+        turn = rotation_matrix(angle * axis)
         new[u] = compose(trajectory[u], np.concatenate([turn, (center - turn @ center)[:, None]], 1))
     return new
 
@@ -88,4 +88,4 @@ def _turning(trajectory: Trajectory, reference: Trajectory) -> float:
         relative_motion(trajectory, t, t + 1)[:, :3] @ relative_motion(reference, t, t + 1)[:, :3].T
         for t in range(len(trajectory) - 1)
     ]
-    return float(Rotation.from_matrix(np.stack(steps)).magnitude().mean())
+    return float(np.linalg.norm(rotation_vector(np.stack(steps)), axis=-1).mean())

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from dpcli.ops.rotations import rotation_matrix, rotation_vector
 from dpcli.segment.flow.surface_icp import columns
 from dpcli.segment.kinematics.joint_fit import JointFit
 from dpcli.segment.multibody.frames import Frames, Trajectory
@@ -90,7 +90,7 @@ class PointFit:
         axis, point, value, parent = self._moved(change)
         motion = np.zeros((*value.shape, 3, 4))
         if self._shifts:
-            motion[..., :3] = _turns(value[..., None] * axis[:, None])
+            motion[..., :3] = rotation_matrix(value[..., None] * axis[:, None])
             motion[..., 3] = point[:, None] - (motion[..., :3] @ point[:, None, :, None])[..., 0]
         else:
             motion[..., :3], motion[..., 3] = np.eye(3), value[..., None] * axis[:, None]
@@ -131,14 +131,9 @@ def _twisted(parent: np.ndarray, twist: np.ndarray, points: list[np.ndarray], si
     """Returns trajectories (n,T,3,4) turned in every frame but the first, about the middle of its points, and shifted."""
     middle = np.stack([own.mean(1) if own.size else np.zeros(3) for own in points[1:]]).astype(np.float64)
     step = np.zeros((*twist.shape[:2], 3, 4))
-    step[..., :3] = _turns(twist[..., :3])
+    step[..., :3] = rotation_matrix(twist[..., :3])
     step[..., 3] = middle + size * twist[..., 3:] - (step[..., :3] @ middle[..., None])[..., 0]
     return np.concatenate([parent[:, :1], _composed(step, parent[:, 1:])], 1)
-
-
-def _turns(vectors: np.ndarray) -> np.ndarray:
-    """Returns the rotations (...,3,3) by rotation vectors (...,3)."""
-    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
 def _composed(after: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -157,5 +152,4 @@ def _twists(after: np.ndarray, before: np.ndarray, center: np.ndarray) -> np.nda
     """Returns the twists (n,P,6), about centers (P,3), that lead from motions (P,3,4) to others (n,P,3,4)."""
     turn = after[..., :3] @ np.swapaxes(before[..., :3], -1, -2)
     place = (turn @ (center - before[..., 3])[..., None])[..., 0] + after[..., 3]
-    vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-1])
-    return np.concatenate([vectors, place - center], -1)
+    return np.concatenate([rotation_vector(turn), place - center], -1)
