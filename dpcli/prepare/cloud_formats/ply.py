@@ -84,7 +84,7 @@ def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
     """Returns the byte order ("" for text) and the elements; the file stands behind the header."""
     head = file.read(_HEADER_BYTES)
     mark = 3 if head.startswith(b"\xef\xbb\xbf") else 0
-    found = re.search(rb"[\r\n]end_header", head)  # a line of its own: comments may mention it
+    found = re.search(rb"[\r\n]end_header[ \t]*", head)  # a line of its own: comments may mention it
     if head[mark : mark + 3] != b"ply" or found is None:
         raise DataError(f"{path}: not a PLY point cloud: no number of points in its header")
     end, after = found.start(), found.end()

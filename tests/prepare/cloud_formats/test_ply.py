@@ -110,6 +110,13 @@ def test_a_mark_before_the_header_and_windows_line_ends(tmp_path):
     assert read_ply(path).points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+@pytest.mark.parametrize("ends", [" \n", "\t\n", "  \r\n"])
+def test_blanks_behind_the_header_are_no_coordinates(tmp_path, ends):
+    head = text_ply([], count=3).replace("ascii", "binary_little_endian").removesuffix("\n") + ends
+    (tmp_path / "a.ply").write_bytes(head.encode() + np.float32(POINTS).tobytes())
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").points, np.float32(POINTS))
+
+
 def test_a_text_that_ends_early_and_not_a_number(tmp_path):
     with pytest.raises(DataError, match="says 5 points, it has room for 2"):
         read_text(tmp_path / "a.ply", ["1 2 3", "4 5 6"], count=5)
