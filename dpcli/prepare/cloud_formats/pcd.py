@@ -24,10 +24,12 @@ POSED = "frames with a sensor pose (VIEWPOINT of PCD), which is not applied: poi
 class Header:
     """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data.
 
-    posed: whether it tells where the sensor stood, other than at the origin of the points. unit: as comments tell it.
+    counts: numbers of each field. posed: whether it tells where the sensor stood, other than at the origin of the points.
+    unit: as comments tell it.
     """
 
     kind: np.dtype
+    counts: tuple[int, ...]
     points: int
     data: str
     length: int
@@ -75,7 +77,7 @@ def _read_header(path: Path, data: bytes) -> Header:
     if form not in _DATA:
         raise DataError(f"{path}: DATA {form}; expected {', '.join(_DATA)}")
     posed, unit = _posed(said.get("VIEWPOINT", [])), unit_of_comments(comments)
-    return Header(_row_type(path, said), points, form, start, lines, posed, unit)
+    return Header(*_row_type(path, said), points, form, start, lines, posed, unit)
 
 
 def _points(path: Path, said: dict[str, list[str]]) -> int:
@@ -101,7 +103,7 @@ def _posed(words: list[str]) -> bool:
     return any((x, y, z, i, j, k))
 
 
-def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
+def _row_type(path: Path, said: dict[str, list[str]]) -> tuple[np.dtype, tuple[int, ...]]:
     names = said.get("FIELDS") or said.get("COLUMNS") or []
     sizes, types = said.get("SIZE", ["4"] * len(names)), said.get("TYPE", ["F"] * len(names))
     counts = said.get("COUNT", ["1"] * len(names))
@@ -119,7 +121,7 @@ def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
                 raise DataError(f"{path}: field {name} is there twice")
             taken.add(own)
             row.append((own, f"<{kind.lower()}{size}"))
-    return np.dtype(row)
+    return np.dtype(row), tuple(map(int, counts))
 
 
 def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
@@ -143,7 +145,7 @@ def _lines(body: bytes) -> str:
 
 
 def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, np.ndarray]:
-    """Returns the columns, which lie one after the other in one block packed by LZF."""
+    """Returns the columns of fields that lie one after the other in one block packed by LZF, all numbers of a point together."""
     if len(body) < 8:
         require_points(path, header.points + 1, 0)
     packed, size = struct.unpack("<II", body[:8])
@@ -154,11 +156,13 @@ def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, 
     if len(body) < 8 + packed:
         raise DataError(f"{path}: truncated: {len(body) - 8} of its {packed} compressed bytes are left")
     raw = _unpack_lzf(path, bytes(body[8 : 8 + packed]), size) if size else b""
-    columns, start = {}, 0
-    for name in header.kind.names or ():
-        kind = header.kind[name]
-        columns[name] = np.frombuffer(raw, kind, header.points, start)
-        start += header.points * kind.itemsize
+    columns: dict[str, np.ndarray] = {}
+    names, start = header.kind.names or (), 0
+    for count in header.counts:
+        own = names[len(columns) : len(columns) + count]
+        block = np.frombuffer(raw, header.kind[own[0]], header.points * count, start)
+        columns |= dict(zip(own, block.reshape(-1, count).T))
+        start += block.nbytes
     return columns
 
 

@@ -106,6 +106,18 @@ def test_several_blanks_decimal_commas_and_an_old_version(tmp_path):
     np.testing.assert_array_equal(points, [[1.5, 2, 3], [4, 5.25, np.nan]])
 
 
+def test_numbers_of_a_compressed_field_lie_point_after_point(tmp_path):
+    """As PCL packs them: all numbers of a field's first point, then those of its second."""
+    points, normals = np.arange(9, dtype="<f4").reshape(3, 3), np.arange(10, 19, dtype="<f4").reshape(3, 3)
+    raw = points[:, :2].T.tobytes() + normals.tobytes() + points[:, 2].tobytes()
+    packed = b"".join(bytes([len(raw[k : k + 32]) - 1]) + raw[k : k + 32] for k in range(0, len(raw), 32))
+    head = header("x y normal z", "4 4 4 4", "F F F F", "1 1 3 1", points=3, data="binary_compressed")
+    (tmp_path / "a.pcd").write_bytes(head.encode() + np.array([len(packed), len(raw)], "<u4").tobytes() + packed)
+    cloud = read_pcd(tmp_path / "a.pcd", keep=[f"normal_2_{k}" for k in range(3)])
+    np.testing.assert_array_equal(cloud.points, points)
+    np.testing.assert_array_equal(np.stack(list(cloud.extra.values()), axis=1), normals)
+
+
 def test_damaged_compression_is_named(tmp_path):
     values = np.random.default_rng(0).integers(0, 3, 300).astype(np.float32)
     path = tmp_path / "a.pcd"
