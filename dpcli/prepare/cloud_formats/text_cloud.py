@@ -25,6 +25,7 @@ from dpcli.prepare.cloud_formats.text_numbers import COMMENTS, TextTable, read_t
 _MARK = re.compile(
     r"\b(frame|scan|sweep|step|cloud|time|time_?stamp|t)\b[\s_.:=#]*(id|no|number|index)?[\s:=#]*\d", re.IGNORECASE
 )
+EMPTY = "rows with nothing between their delimiters dropped"
 BLOCKS = "texts whose rows stand in blocks between empty lines, each read as one cloud"
 _TELLING = 10  # rows that tell what columns without names hold
 _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
@@ -41,15 +42,21 @@ def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud from a text. Raises DataError when it holds several frames, or is no table of numbers."""
     table = read_text_table(path, may_be_empty=True)
     if not table.first_rows(1):  # a count of 0, or names alone
-        return cloud_of_columns(path, {name: np.empty(0) for name in table.names or "xyz"}, keep)
+        return _counted(cloud_of_columns(path, {name: np.empty(0) for name in table.names or "xyz"}, keep), table)
     if not table.names:
         names = _IMPLIED.get((path.suffix.lower(), table.width), "")
         table = replace(table, names=tuple(names.split()))
     refuse_frames(table)
     _refuse_marked_frames(table)
-    cloud = cloud_of_table(table, keep)
-    more = table.body.count("\n") > len(cloud.points) + 1  # lines than points: looking for blocks takes longer
-    return replace(cloud, dropped={BLOCKS: 1}) if more and "\n\n\n" in table.body.rstrip() else cloud
+    return _counted(cloud_of_table(table, keep), table)
+
+
+def _counted(cloud: Cloud, table: TextTable) -> Cloud:
+    """Returns the cloud of a table with what lies between its points."""
+    if table.body.rstrip("\n").count("\n") < len(cloud.points):  # no more lines: looking at them takes longer
+        return cloud
+    told = {BLOCKS: int("\n\n\n" in table.body.rstrip()), EMPTY: table.empty_rows}
+    return replace(cloud, dropped={what: count for what, count in told.items() if count})
 
 
 def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:

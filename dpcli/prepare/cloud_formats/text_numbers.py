@@ -57,8 +57,8 @@ class TextTable:
     @cached_property
     def numbered(self) -> list[tuple[int, str]]:
         """Returns the rows with the number of their line; no empty ones, no comments, no header that comes again."""
-        lines = enumerate(self.body.split("\n"), self.first_line)
-        rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not _is_comment(line))
+        lines, blank = enumerate(self.body.split("\n"), self.first_line), f" {self.delimiter or ''}"
+        rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip(blank).strip() and not _is_comment(line))
         return list(islice((row for row in rows if row[1] != self.header or not self.header), self.limit))
 
     @property
@@ -66,6 +66,12 @@ class TextTable:
         """Returns the number of rows of the whole text, those beyond ``limit`` too."""
         lines = self.body.count("\n") + (not self.body.endswith("\n"))
         return lines if lines == self.limit else len(replace(self, limit=None).numbered)
+
+    @property
+    def empty_rows(self) -> int:
+        """Returns how many rows hold nothing between their delimiters, as pandas writes points of NaN; `numbered` lacks them."""
+        sign = self.delimiter or "\n"
+        return sum(sign in line and not line.strip(f" {sign}").strip() for line in self.body.split("\n"))
 
     @cached_property
     def width(self) -> int:
@@ -377,7 +383,7 @@ def _without_count(table: TextTable, counted: tuple[int, str], *_: tuple[int, st
 def _checked_unnamed(table: TextTable) -> TextTable:
     """Returns the table. Raises DataError when its numbers seem cut by their own decimal commas."""
     rows = table.first_rows(_LOOKED_AT)
-    if table.delimiter == "," and not any('"' in line for _, line in rows):
+    if rows and table.delimiter == "," and not any('"' in line for _, line in rows):
         cells = [cell for _, line in rows for cell in table.cells(line)]
         whole = all(re.fullmatch(r"[-+]?\d+|", cell) for cell in cells)
         spaced = all(_SPACED_COMMAS.fullmatch(line) for _, line in rows)

@@ -15,7 +15,7 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, read_text
+from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, EMPTY, read_text
 from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
@@ -249,6 +249,19 @@ def test_comments_and_empty_lines_between_rows(tmp_path):
     assert len(read(tmp_path / "a.xyz", "1 2 3\n# 5 outliers left out\n4 5 6\n# frame 7\n").points) == 2
     assert read(tmp_path / "a.xyz", "1 2 3\n\n4 5 6\n\n\n").dropped == {}
     assert read(tmp_path / "a.xyz", "1 2 3\n\n\n4 5 6\n").dropped == {BLOCKS: 1}
+
+
+@pytest.mark.parametrize("sign", [",", ";", "\t", "|"])
+@pytest.mark.parametrize(("columns", "word"), [("xyz", ""), ("xyzi", ""), ("xyzi", "car")])
+def test_rows_of_nothing_are_dropped_and_counted(tmp_path, sign, columns, word):
+    """As pandas writes points of NaN, and spreadsheets what was deleted."""
+    row = sign.join(["1.5", "2.5", "3.5", word or "4.5"][: len(columns)])
+    rows = [sign.join(columns), row, sign * (len(columns) - 1), row, sign * (len(columns) - 1)]
+    for end, empty in (("\n", 2), ("\n" + row, 2), ("\n" + rows[-1] + "\n\n", 3)):
+        cloud = read(tmp_path / "a.csv", "\n".join(rows) + end)
+        assert (cloud.points == [1.5, 2.5, 3.5]).all() and cloud.dropped == {EMPTY: empty}
+    if sign != "\t":  # tabs alone are blanks
+        assert read(tmp_path / "a.csv", "\n".join([rows[0], rows[-1], rows[-1]])).dropped == {EMPTY: 2}
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):
