@@ -41,7 +41,32 @@ class Reversed:
         return np.asarray(self._dataset[full[::-1]]).T
 
 
-Array = Any  # np.ndarray, h5py.Dataset or Reversed: shape, dtype, ndim, and slices of it by []
+class Unpacked:
+    """Shows a data set that netCDF packed (xarray, sensors of weather and satellites) as the numbers that its attributes say it
+    stands for, f64.
+    """
+
+    dtype = np.dtype(np.float64)
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset, self.attrs = dataset, dataset.attrs
+        self.shape: tuple[int, ...] = dataset.shape
+        self.ndim = len(self.shape)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        stored = np.asarray(self._dataset[key], np.float64)
+        missing = np.isin(stored, [_attribute(self, name, np.nan) for name in ("_FillValue", "missing_value")])
+        values = stored * _attribute(self, "scale_factor", 1) + _attribute(self, "add_offset", 0)
+        return np.where(missing, np.nan, values)
+
+
+def _attribute(dataset: Any, name: str, default: float) -> float:
+    """Returns the number that an attribute tells, the default where it tells none."""
+    told = np.ravel(dataset.attrs.get(name, default))
+    return float(told[0]) if told.dtype.kind in "uif" and told.size == 1 else default
+
+
+Array = Any  # np.ndarray, h5py.Dataset, Reversed or Unpacked: shape, dtype, ndim, and slices of it by []
 
 
 @contextmanager
@@ -101,7 +126,8 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
                 found |= {name: cells} if (cells := _cells(file, item, path)) else {}
             elif item.dtype.kind in "uif" and item.ndim:
-                found[name] = Reversed(item) if matlab else item
+                packed = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
+                found[name] = Reversed(item) if matlab else Unpacked(item) if packed else item
         yield found
 
 

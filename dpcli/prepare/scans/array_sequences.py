@@ -19,6 +19,7 @@ from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
@@ -216,6 +217,7 @@ class ArraySequences(OwnScans):
             kept = {name: self._column(item.path, arrays, name, source, axes) for name in self.keep}
             time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(arrays, beside, axes, source, frames)
+            unit = _unit(arrays[source.keys[0]])
         if item.extra["time"] and time is None:
             if not self.fps:
                 raise DataError(
@@ -228,6 +230,7 @@ class ArraySequences(OwnScans):
             Cloud(
                 frame,
                 None if colors is None else colors[t],
+                unit,
                 extra={name: values[t].astype(np.float32) for name, values in kept.items()},
             )
             for t, frame in enumerate(frames)
@@ -344,6 +347,12 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
             f"{path}: some of its {len(parts)} clouds are (3, points) and some (points, 3 or more); save them alike"
         )
     return [_as_points(one.T if by_columns else one) if one.size else np.zeros((0, 3), np.float32) for one in parts]
+
+
+def _unit(array: Any) -> str:
+    """Returns the unit that an attribute of an HDF5 data set tells, "" without one."""
+    told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
+    return unit_of_comments([f"units: {one.decode('latin-1') if isinstance(one, bytes) else one}" for one in told])
 
 
 def _as_points(array: np.ndarray) -> np.ndarray:

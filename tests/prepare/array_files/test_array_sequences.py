@@ -110,6 +110,23 @@ def test_counts_masks_and_times_beside_the_clouds(tmp_path, form):
     assert same(found, [frame[own] for frame, own in zip(clouds, mask)])
 
 
+@pytest.mark.parametrize("told", ["mm", b"millimeters", np.array([b"mm"])])
+def test_what_attributes_of_an_hdf5_say_of_its_numbers(tmp_path, told):
+    """As xarray and netCDF write them: whole numbers that are packed, and a unit."""
+    clouds = np.round(untracked(11, 8, 30), 3) * 1000
+    stored = np.round((clouds - 20) / 0.5).astype(np.int16)
+    stored[0, :4] = -32768
+    path = write(tmp_path / "packed", "h5", points=stored, plain=clouds)
+    with h5py.File(path, "r+") as file:
+        file["points"].attrs.update({"scale_factor": 0.5, "add_offset": [20.0], "_FillValue": np.int16(-32768)})
+        file["points"].attrs["units"] = file["plain"].attrs["units"] = told
+    expected = [clouds[0, 4:] / 1000, *clouds[1:] / 1000]
+    assert all(np.abs(a - b).max() < 4e-4 for a, b in zip(read(path)["packed"], expected, strict=True))
+    with h5py.File(path, "r+") as file:
+        del file["points"]
+    assert same(read(path, "--unit", "m")["packed"], np.float32(clouds / 1000))
+
+
 def test_values_and_shape_that_leave_a_choice_are_asked_for(tmp_path, capsys):
     for name, array, answer, frames in (
         ("grid", rows_and_columns(24, 32), "NNC", [rows_and_columns(24, 32).reshape(-1, 3)]),
