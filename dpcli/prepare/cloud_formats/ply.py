@@ -69,7 +69,8 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
             chunks, rows = (_read_binary(path, file, order, element, [])[0] for element in (before[0], vertex))
             return unpack_supersplat(path, chunks, rows, keep)
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
-            return replace(cloud_of_columns(path, _read_with_lists(path, vertex), keep), unit=unit)
+            cloud = cloud_of_columns(path, _read_with_lists(path, vertex), keep)
+            return replace(cloud, unread=cloud.unread + tuple(vertex.lists), unit=unit)
         if order:
             columns, rest = _read_binary(path, file, order, vertex, before)
         else:

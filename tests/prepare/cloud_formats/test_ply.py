@@ -110,6 +110,17 @@ def test_a_mark_before_the_header_and_windows_line_ends(tmp_path):
     assert read_ply(path).points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
+def test_lists_of_vertices_are_named(tmp_path):
+    rows = np.zeros(3, [*((axis, "f4") for axis in "xyz"), ("tags", object)])
+    for k, axis in enumerate("xyz"):
+        rows[axis] = [point[k] for point in POINTS]
+    rows["tags"] = [np.arange(k, dtype="i4") for k in range(3)]
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
+    cloud = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
+    assert cloud.unread == ("tags",)
+
+
 @pytest.mark.parametrize("ends", [" \n", "\t\n", "  \r\n"])
 def test_blanks_behind_the_header_are_no_coordinates(tmp_path, ends):
     head = text_ply([], count=3).replace("ascii", "binary_little_endian").removesuffix("\n") + ends
