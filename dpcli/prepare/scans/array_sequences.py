@@ -15,7 +15,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
-from dpcli.prepare.array_files.axes import axes_of, check_axes, choices
+from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
 from dpcli.prepare.cloud_formats.cloud import Cloud
@@ -279,12 +279,15 @@ class ArraySequences(OwnScans):
                     *(one.extra["source"].keys[0] for one in self._items if one.path == item.path and not one.problem),
                 }
                 unread = [name for name in arrays if name not in used]
-                shape = tuple(arrays[source.keys[0]].shape) if axes else ()
+                first = arrays[source.keys[0]]
+                shape = tuple(first.shape) if axes else ()
+                shapes = [one.shape for one in first if one.size] if isinstance(first, list) else [first.shape]
         except DataError:
             return ""
+        told = [own[place] for own in shapes if (place := coordinates_axis(own)) is not None]
+        columns = shape[axes.index("C")] if axes else max(told, default=3)
         said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
-        extra = shape[axes.index("C")] - 3 if axes else 0
-        said += f"; of each point the first 3 of {extra + 3} numbers are read" if extra else ""
+        said += f"; of each point the first 3 of {columns} numbers are read" if 3 < columns else ""
         return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
 
 

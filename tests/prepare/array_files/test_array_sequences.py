@@ -166,6 +166,18 @@ def test_frames_of_unlike_sizes(tmp_path):
         assert same(found, frames), name
 
 
+def test_numbers_of_points_that_are_not_read_are_counted(tmp_path, capsys):
+    frames = [np.random.default_rng(count).normal(size=(count, 6)) for count in range(20, 30)]
+    cell = np.empty(10, object)
+    cell[:] = frames
+    np.savez(tmp_path / "frames.npz", **{f"frame_{t}": frame for t, frame in enumerate(frames)})
+    np.save(tmp_path / "list.npy", cell, allow_pickle=True)
+    for name in ("frames.npz", "list.npy"):
+        (found,) = read(tmp_path / name).values()
+        assert same(found, [frame[:, :3] for frame in frames])
+        assert "of each point the first 3 of 6 numbers are read" in capsys.readouterr().err
+
+
 def test_a_pickle_of_code_is_not_loaded(tmp_path):
     bad = np.empty(1, object)
     bad[0] = print
