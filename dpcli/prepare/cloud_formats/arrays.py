@@ -51,7 +51,11 @@ def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
 def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[str]) -> Cloud:
     key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
     if key is None and {"x", "y", "z"} <= arrays.keys():
-        return cloud_of_columns(path, {k: a for k, a in arrays.items() if a.shape == arrays["x"].shape}, keep)
+        shape = arrays["x"].shape  # perhaps rows and columns of a grid
+        alike = {k: a.reshape(-1) for k, a in arrays.items() if a.shape == shape}
+        cloud = cloud_of_columns(path, alike, keep)
+        cloud.unread += without(list(arrays), alike)
+        return cloud
     if key is None:
         raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
@@ -81,7 +85,10 @@ def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
 def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud:
     if array.dtype.names:
         flat = array.reshape(-1)
-        return cloud_of_columns(path, {name: flat[name] for name in array.dtype.names}, keep)
+        single = [name for name in array.dtype.names if array.dtype[name].shape in ((), (1,))]
+        cloud = cloud_of_columns(path, {name: flat[name].reshape(-1) for name in single}, keep)
+        cloud.unread += without(array.dtype.names, single)
+        return cloud
     if keep:
         raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
     if array.shape == (0,):  # of an empty list of points

@@ -67,6 +67,23 @@ def test_archives_whose_points_are_called_otherwise(tmp_path, arrays):
     assert cloud.unread == tuple(name for name in arrays if name in ("snr", "normals", "label"))
 
 
+def test_columns_of_other_shapes_are_read_or_named(tmp_path):
+    """x, y and z may be a grid of rows and columns, or columns of one; several numbers a point are no column."""
+    points = np.random.default_rng(0).uniform(0, 2, (20, 3))
+    for shape in ((20,), (4, 5), (20, 1)):
+        axes = {name: points[:, k].reshape(shape) for k, name in enumerate("xyz")}
+        np.savez(tmp_path / "a.npz", **axes, v=axes["x"], colors=np.zeros((20, 3), np.uint8))
+        cloud = read_npz(tmp_path / "a.npz")
+        np.testing.assert_array_equal(cloud.points, points)
+        assert cloud.unread == ("v", "colors")
+    rows = np.zeros(20, [("x", "f8", (1,)), ("y", "f8"), ("z", "f8"), ("rgb", "u1", (3,)), ("v", "f4")])
+    rows["x"], rows["y"], rows["z"] = points[:, :1], points[:, 1], points[:, 2]
+    np.save(tmp_path / "a.npy", rows)
+    cloud = read_npy(tmp_path / "a.npy")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert cloud.color is None and cloud.unread == ("v", "rgb")
+
+
 def test_pictures_and_poses_are_no_points(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((48, 64)))
     with pytest.raises(DataError, match=r"\(48, 64\); .* is it a picture, such as of depth"):
