@@ -36,6 +36,9 @@ _NO_VERTEX = "a face names a vertex that is not there"
 _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
+_LOST = re.compile(  # what pycollada says where a mesh, or how it is turned, is missing, not a lamp or a picture
+    r"(Geometry|Material|Node) \S+ not found|skew|transform|node requires|(geometry|node) instance|id in material"
+)
 _SOLID = rb"(?i)\s*solid"
 _SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
@@ -113,7 +116,16 @@ def _read_off(path: Path, root: Path | None) -> Any:
 
 
 def _read_dae(path: Path, root: Path | None) -> Any:
+    from collada import Collada
+    from collada.common import DaeError
+
     _check_collada(path)
+    try:
+        return _by_trimesh(path, root, ignore_broken=False)
+    except (DaeError, RuntimeError):  # perhaps of a lamp or a picture alone; the second where it raises nothing again
+        lost = [one.msg for one in Collada(str(path), ignore=[DaeError]).errors if _LOST.search(one.msg)]
+    if lost:
+        raise DataError(f"{path}: a part of it would be left out ({lost[0]:.100}); repair it, or export it again")
     return _by_trimesh(path, root)
 
 
@@ -184,6 +196,8 @@ def _check_collada(path: Path) -> None:
         raise DataError(f"{path}: it has no scene, so nothing in it is placed; export it again")
     if b"instance_controller" in data:
         raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
+    if re.search(rb"<(\w+:)?ph\b", data):
+        raise DataError(f"{path}: it has polygons with holes, which are not read; export it as triangles")
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return

@@ -84,6 +84,35 @@ def test_collada_is_refused_where_its_reader_would_reach_beyond_a_polygon(tmp_pa
             assert load_mesh(path, None).area == pytest.approx(area(STAR[corners]))
 
 
+LAMP = '<node id="lamp"><instance_light url="#gone"/></node>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("</visual_scene>", f"{LAMP}</visual_scene>", ""),
+        ("</visual_scene>", '<node id="n"><instance_geometry url="#gone"/></node></visual_scene>', "Geometry #gone"),
+        ('target="#', 'target="#gone', "Material #gone"),
+        ("<triangles", "<linestrips/><triangles", "Geometry #"),
+        ("<triangles", "<polygons><ph/></polygons><triangles", "polygons with holes"),
+        ("<instance_geometry", "<skew>45 0 1 0 1 0 0</skew><instance_geometry", "skew"),
+        ("<instance_geometry", "<translate>1 two 3</translate><instance_geometry", "translate"),
+    ],
+)
+def test_a_part_that_a_reader_of_collada_leaves_out_is_named(tmp_path, old, new, said):
+    from trimesh.creation import box, icosphere
+    from trimesh.exchange.dae import export_collada
+
+    path, text = tmp_path / "m.dae", export_collada([box(), icosphere(subdivisions=0)]).decode()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    if said:
+        with pytest.raises(DataError, match=f"m.dae: .*{said}.*export it"):
+            load_mesh(path, None)
+    else:
+        assert len(load_mesh(path, None).faces) == 32
+
+
 def test_triangles_and_squares_together_in_a_binary_ply(tmp_path):
     """As Blender and MeshLab write them, with coordinates of textures beside the corners."""
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 4\n" + "".join(f"property float {k}\n" for k in "xyz")
