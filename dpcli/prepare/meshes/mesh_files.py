@@ -31,6 +31,8 @@ _STL_HEAD, _STL_FACE = 84, 50  # bytes
 _WORD = rb"(?!0)[^\s\\-]+[ \t]*"
 # a face of anything but three corners by numbers from 1, or one that goes on in the next line
 _ODD_FACE = re.compile(rb"\n[ \t]*f[ \t]+(?!%b(?<=[ \t])%b(?<=[ \t])%b(?:[\r\n#]|\Z))[^\r\n]" % (_WORD, _WORD, _WORD))
+# a line that trimesh passes over, or ends at: with blanks before it, a tab, or a comment behind
+_ODD_LINE = re.compile(rb"(?:\n|\A)(?:[ \t]+[vf][ \t]|[vf]\t|[vf] [^\n#]*#)")
 _COMMA = re.compile(rb"\nv[ \t]+-?\d+,\d")
 _NO_VERTEX = "a face names a vertex that is not there"
 _BEGINNING = 4096  # bytes of a file that show how it writes numbers
@@ -84,7 +86,7 @@ def _read_obj(path: Path, root: Path | None) -> Any:
     data = path.read_bytes().removeprefix(_MARK)
     if _COMMA.search(b"\n" + data[:_BEGINNING]):
         raise DataError(f"{path}: numbers with decimal commas; export it with points")
-    if _ODD_FACE.search(data):
+    if _ODD_FACE.search(data) or _ODD_LINE.search(data):
         return _mesh_of(_of_obj(data))
     return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="obj", skip_materials=True)
 

@@ -84,6 +84,17 @@ def test_collada_is_refused_where_its_reader_would_reach_beyond_a_polygon(tmp_pa
             assert load_mesh(path, None).area == pytest.approx(area(STAR[corners]))
 
 
+@pytest.mark.parametrize("old", ["v 1 0 0", "f 1 2 3", "f 2 4 3", "v 0 0 0"])
+@pytest.mark.parametrize("style", ["  {}", "\t{}", "{} # a comment", "{}\t"])
+def test_lines_of_an_obj_may_be_indented_commented_and_hold_tabs(tmp_path, old, style):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 2\nf 1 2 3\nf 2 4 3\n"
+    (tmp_path / "m.obj").write_text(text)
+    expected = load_mesh(tmp_path / "m.obj", None).triangles
+    for line in (style.format(old), style.format(old).replace(" ", "\t", 1)):
+        (tmp_path / "m.obj").write_text(text.replace(old, line))
+        np.testing.assert_array_equal(load_mesh(tmp_path / "m.obj", None).triangles, expected)
+
+
 LAMP = '<node id="lamp"><instance_light url="#gone"/></node>'
 
 
