@@ -134,8 +134,9 @@ def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.nd
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
         whole = kind.kind == "f" or (np.isfinite(column).all() and (column == np.floor(column)).all())
-        # whole numbers, as some write them
-        packed = name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()
+        # whole numbers, as some write them, or a color whose bytes are no number, which a text can't hold
+        odd = (column >= 1) | (np.isnan(column) & np.isfinite(values).any(1))
+        packed = name in ("rgb", "rgba") and kind.kind == "f" and odd.any()
         columns[name] = column if packed or not whole else column.astype(kind)
     return columns, beyond
 

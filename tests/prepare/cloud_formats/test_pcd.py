@@ -81,6 +81,17 @@ def test_packed_colors_in_texts(tmp_path, packed):
     assert np.abs(color.astype(int) - 64).max() <= (48 if "e" in packed else 0)  # the first has few digits left
 
 
+def test_a_color_of_a_text_that_is_no_number_is_none(tmp_path):
+    """As writers of float32 leave it of alpha 255 and much red; points that nothing measured need no color."""
+    dark, text = np.uint32([0x10203040]).view(np.float32)[0], header("x y z rgb", "4 4 4 4", "F F F F", "1 1 1 1")
+    for row, color in (("nan nan nan nan", [[32, 48, 64]]), ("4 5 6 nan", None)):
+        (tmp_path / "a.pcd").write_text(f"{text}1 2 3 {dark:.9g}\n{row}\n")
+        cloud = read_pcd(tmp_path / "a.pcd")
+        assert (
+            (cloud.color is None and cloud.unread == ("rgb",)) if color is None else cloud.color[:1].tolist() == color
+        )
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
