@@ -14,6 +14,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
     kept_columns,
+    refuse_times,
     require_columns,
     unnamed_columns,
     without,
@@ -108,6 +109,7 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         raise DataError(
             f"{path}: a matrix {array.shape} that turns, the pose of a camera; expected numbers (points, 3 or more)"
         )
+    refuse_times(path, array)
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
     counted = _counts_rows(array)
     unread = (*(("column 1 (no name, numbers of the rows)",) * counted), *unnamed_columns(4 + counted, array.shape[1]))

@@ -16,6 +16,7 @@ _TINY = 1e-36  # below it and above its inverse lie no numbers but those whose b
 AT_ORIGIN = "points at (0,0,0) dropped"
 _WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
 _HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussians: color seen from all sides
+_LOOKED_AT, _NO_MAP = 1000, 1e6  # rows that tell what a column holds; coordinates below which no map's lie, in any unit
 MOST_UNNAMED = 40  # columns; a picture has more
 BEYOND = "points beyond the number that their file's header says dropped"
 
@@ -109,6 +110,22 @@ def require_columns(path: Path, rows: int, columns: int) -> None:
         f"{path}: array of shape {(rows, columns)}; expected numbers (points, 3 or more)"
         + (picture if columns > MOST_UNNAMED else "")
     )
+
+
+def refuse_times(path: Path, values: np.ndarray) -> None:
+    """Raises DataError where the first of four columns or more without names (N,C) holds times since 1970, in any unit, beside
+    three that are no map's coordinates.
+    """
+    some = values[:_LOOKED_AT, :4].astype(np.float64)
+    some = some[np.isfinite(some).all(1)]
+    if not len(some) or some.shape[1] < 4 or np.abs(some[:, 1:]).max() > _NO_MAP:
+        return
+    least, most = some[:, 0].min(), some[:, 0].max()
+    if any(1e9 * parts < least <= most < 2e9 * parts for parts in (1, 1e3, 1e6, 1e9)):
+        raise DataError(
+            f"{path}: its first column seems to hold times ({least:.16g}), not x; put it behind x y z, or, in a text, write a"
+            " line of names above: time x y z"
+        )
 
 
 def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None:

@@ -15,6 +15,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
     named_axes,
+    refuse_times,
     require_columns,
     unnamed_columns,
     without,
@@ -67,6 +68,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
         if not 3 <= table.width <= MOST_UNNAMED:
             require_columns(table.path, len(table.numbered), table.width)
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
+        refuse_times(table.path, values)
         first = _first_axis(table, values)
         counted = ("column 1 (no name, numbers of the rows)",) if first else ()
         unread = counted + unnamed_columns(first + 4, table.width)

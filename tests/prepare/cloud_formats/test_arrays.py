@@ -84,6 +84,25 @@ def test_columns_of_other_shapes_are_read_or_named(tmp_path):
     assert cloud.color is None and cloud.unread == ("v", "rgb")
 
 
+@pytest.mark.parametrize("parts", [1, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("suffix", [".npy", ".txt", ".xyz"])
+def test_a_first_column_of_times_is_no_axis(tmp_path, suffix, parts):
+    points = np.random.default_rng(0).normal(0, 50, (20, 3))
+    times = (1_709_649_057.25 + np.arange(20) * 1e-3) * parts
+    path = tmp_path / f"a{suffix}"
+    for columns, refused in (([times, *points.T], True), ([*points.T, times], False), ([times, *points.T[:2]], False)):
+        rows = np.stack(columns, axis=1)
+        np.save(path, rows) if suffix == ".npy" else np.savetxt(path, rows, "%.6f")
+        if refused:
+            with pytest.raises(DataError, match=r"first column seems to hold times \(1\.?709649"):
+                read_cloud(path)
+        else:
+            np.testing.assert_allclose(read_cloud(path).points, rows[:, :3], atol=1e-6)
+    rows = np.stack([1.5e9 + points[:, 0], 4e6 + points[:, 1], points[:, 2], times], axis=1)  # a map, in millimeters
+    np.save(path.with_suffix(".npy"), rows)
+    np.testing.assert_array_equal(read_cloud(path.with_suffix(".npy")).points, rows[:, :3])
+
+
 def test_pictures_and_poses_are_no_points(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((48, 64)))
     with pytest.raises(DataError, match=r"\(48, 64\); .* is it a picture, such as of depth"):
