@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -217,7 +218,7 @@ class ArraySequences(OwnScans):
             kept = {name: self._column(item.path, arrays, name, source, axes) for name in self.keep}
             time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(arrays, beside, axes, source, frames)
-            unit = _unit(arrays[source.keys[0]])
+            unit = unit_of_comments([f"units: {_told_units(arrays[source.keys[0]])}"])
         if item.extra["time"] and time is None:
             if not self.fps:
                 raise DataError(
@@ -352,10 +353,10 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
     return [_as_points(one.T if by_columns else one) if one.size else np.zeros((0, 3), np.float32) for one in parts]
 
 
-def _unit(array: Any) -> str:
-    """Returns the unit that an attribute of an HDF5 data set tells, "" without one."""
+def _told_units(array: Any) -> str:
+    """Returns what the attribute ``units`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05", "" without one."""
     told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
-    return unit_of_comments([f"units: {one.decode('latin-1') if isinstance(one, bytes) else one}" for one in told])
+    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
 
 
 def _as_points(array: np.ndarray) -> np.ndarray:
@@ -380,7 +381,8 @@ def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source)
         return None
     array = arrays[beside.times]
     values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place).astype(np.float64)
-    since = (values - values[0]) * seconds_of(beside.times.rpartition("/")[2], values)
+    name, unit = beside.times.rpartition("/")[2], re.match(r"[^\W\d]+", _told_units(array))
+    since = (values - values[0]) * seconds_of(f"{name} [{unit[0]}]" if unit else name, values)
     return since if len(since) < 2 or (np.diff(since) > 0).all() else None
 
 

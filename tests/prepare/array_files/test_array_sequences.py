@@ -127,6 +127,20 @@ def test_what_attributes_of_an_hdf5_say_of_its_numbers(tmp_path, told):
     assert same(read(path, "--unit", "m")["packed"], np.float32(clouds / 1000))
 
 
+@pytest.mark.parametrize(
+    ("told", "seconds"),
+    [("hours since 2024-03-05", 3600), (b"milliseconds", 1e-3), ("s", 1), ("days", 86400), ("ticks", 0)],
+)
+def test_units_of_times_that_attributes_of_an_hdf5_tell(tmp_path, told, seconds):
+    path = write(tmp_path / "timed", "h5", points=untracked(12, 5, 30), time=np.arange(5) * 1.5)
+    with h5py.File(path, "r+") as file:
+        file["time"].attrs["units"] = told
+    read(path)
+    with CloudsReader(tmp_path / "timed-0.converted") as reader:
+        time = reader.read(0).time
+    assert np.allclose(time, np.arange(5) * 1.5 * seconds) if seconds else time is None
+
+
 def test_values_and_shape_that_leave_a_choice_are_asked_for(tmp_path, capsys):
     for name, array, answer, frames in (
         ("grid", rows_and_columns(24, 32), "NNC", [rows_and_columns(24, 32).reshape(-1, 3)]),
