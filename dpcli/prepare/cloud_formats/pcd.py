@@ -138,7 +138,7 @@ def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.nd
         odd = (column >= 1) | (np.isnan(column) & np.isfinite(values).any(1))
         packed = name in ("rgb", "rgba") and kind.kind == "f" and odd.any()
         columns[name] = column if packed or not whole else column.astype(kind)
-    return columns, beyond
+    return columns, beyond | table.cut
 
 
 def _lines(body: bytes) -> str:

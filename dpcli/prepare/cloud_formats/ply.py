@@ -219,7 +219,7 @@ def _read_text(
         name: _typed(path, name, values[:, k], np.dtype(kind))
         for k, (name, (_, kind)) in enumerate(zip(names, vertex.properties))
     }
-    return columns, rest
+    return columns, rest | table.cut
 
 
 def _typed(path: Path, name: str, values: np.ndarray, kind: np.dtype) -> np.ndarray:

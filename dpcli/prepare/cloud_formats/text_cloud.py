@@ -57,7 +57,7 @@ def _counted(cloud: Cloud, table: TextTable) -> Cloud:
     if table.body.rstrip("\n").count("\n") < len(cloud.points):  # no more lines: looking at them takes longer
         return cloud
     told = {BLOCKS: int("\n\n\n" in table.body.rstrip()), EMPTY: table.empty_rows}
-    return replace(cloud, dropped={what: count for what, count in told.items() if count})
+    return replace(cloud, dropped=cloud.dropped | {what: count for what, count in told.items() if count})
 
 
 def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
@@ -72,7 +72,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
         first = _first_axis(table, values)
         counted = ("column 1 (no name, numbers of the rows)",) if first else ()
         unread = counted + unnamed_columns(first + 4, table.width)
-        return Cloud(values[:, first : first + 3], unit=table.unit, unread=unread)
+        return Cloud(values[:, first : first + 3], unit=table.unit, unread=unread, dropped=table.cut)
     axes = named_axes(table.path, table.names)
     if axes is None:
         raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
@@ -81,7 +81,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     values = table.columns(places)
     cloud = cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
     unread = without([name for name in table.names if name], cloud.columns, keep)
-    return replace(cloud, unread=unread, unit=cloud.unit or table.unit)
+    return replace(cloud, unread=unread, unit=cloud.unit or table.unit, dropped=table.cut)
 
 
 def _first_axis(table: TextTable, values: np.ndarray) -> int:

@@ -31,6 +31,10 @@ _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 _SPACED_COMMAS = re.compile(r"[-+]?\d+,\d+(, +[-+]?\d+,\d+)+")
 _POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+")
 _BELOW_THOUSAND = re.compile(r"[-+]?[1-9]\d{0,2}")  # which groups of thousands leave as they are
+CUT = "frames of texts with numbers such as 5.41123e+06, whose last digits are missing; write more of them"
+_DIGITS = "|".join(rf"\d{{{n}}}e\+?0*(?:[{n + 1}-9]|[1-9]\d)" for n in range(3, 9))  # fewer than the exponent asks for
+_CUT = re.compile(rf"(?<![\d.])\d[.,](?:{_DIGITS})(?!\d)", re.IGNORECASE)
+_SHOWN = 1 << 16  # characters at both ends of a text that tell how it writes numbers
 _EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
 _HEAD = 200  # lines among which the header is looked for
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
@@ -72,6 +76,12 @@ class TextTable:
         """Returns how many rows hold nothing between their delimiters, as pandas writes points of NaN; `numbered` lacks them."""
         sign = self.delimiter or "\n"
         return sum(sign in line and not line.strip(f" {sign}").strip() for line in self.body.split("\n"))
+
+    @property
+    def cut(self) -> dict[str, int]:
+        """Returns a note where numbers lack their last digits, as C++, MATLAB and spreadsheets write large ones; {} where none do."""
+        ends = self.body[:_SHOWN], self.body[-_SHOWN:]
+        return {CUT: 1} if any("e" in end.lower() and _CUT.search(end) for end in ends) else {}
 
     @cached_property
     def width(self) -> int:

@@ -136,7 +136,9 @@ class TableSequences(OwnScans):
         clouds = loaded.frames(part)[:: self.stride]
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
+        sample.notes |= (
+            loaded.cloud.dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
+        )
         sample.notes |= {SINGLE: 1} if len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds) else {}
         return sample
 

@@ -16,6 +16,7 @@ from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, EMPTY, read_text
+from dpcli.prepare.cloud_formats.text_numbers import CUT
 from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
@@ -249,6 +250,34 @@ def test_comments_and_empty_lines_between_rows(tmp_path):
     assert len(read(tmp_path / "a.xyz", "1 2 3\n# 5 outliers left out\n4 5 6\n# frame 7\n").points) == 2
     assert read(tmp_path / "a.xyz", "1 2 3\n\n4 5 6\n\n\n").dropped == {}
     assert read(tmp_path / "a.xyz", "1 2 3\n\n\n4 5 6\n").dropped == {BLOCKS: 1}
+
+
+@pytest.mark.parametrize(
+    ("number", "cut"),
+    [
+        ("5.41123e+06", 1),
+        ("5,41123E+06", 1),
+        ("4.4812e+05", 1),
+        ("1.70965E+12", 1),
+        ("-5.41e6", 0),
+        ("5.411234512e+06", 0),
+    ]
+    + [("1.000000000000000000e+05", 0), ("1e+06", 0), ("5411234.5", 0), ("2.3418e-38", 0), ("1.2346e+04", 0)],
+)
+def test_numbers_without_their_last_digits_are_told(tmp_path, number, cut):
+    """As C++ streams write six digits, MATLAB five, and spreadsheets long numbers; a program that writes them all is left alone."""
+    rows, point = f"1 2 {number}\n4 5 {number}\n", number.replace(",", ".")
+    (tmp_path / "a.ply").write_text(PLY.format("").replace("vertex 1", "vertex 2").replace("1 2 3\n", rows))
+    (tmp_path / "a.pcd").write_text(
+        PCD.format("").replace("1\nDATA", "2\nDATA").replace("TH 1", "TH 2").replace("1 2 3\n", rows)
+    )
+    (tmp_path / "a.csv").write_text("x;y;z\n" + rows.replace(" ", ";"))
+    (tmp_path / "a.txt").write_text("x,y,z\n" + rows.replace(",", ".").replace(" ", ","))
+    (tmp_path / "a.xyz").write_text(rows)
+    for suffix in ("ply", "pcd", "csv", "txt", "xyz"):
+        cloud = read_cloud(tmp_path / f"a.{suffix}")
+        np.testing.assert_allclose(cloud.points[:, 2], float(point), rtol=1e-6)
+        assert cloud.dropped == ({CUT: 1} if cut else {})
 
 
 @pytest.mark.parametrize("sign", [",", ";", "\t", "|"])
