@@ -29,6 +29,7 @@ _COARSE = 0.01  # meters between neighboring float32 numbers, from which on a sh
 COARSE = (
     "sequences whose files hold map coordinates in float32, which rounds them to 1 cm or more; write them in double"
 )
+UNREAD_COLORS = "frames with colors, which are not read, as the first of all has none"
 SHIFTED = "sequences shifted to their first frame's corner for precision"
 
 
@@ -110,6 +111,8 @@ def assemble(
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
     crowded = is_crowded(clouds[kept[len(kept) // 2]].points)
     notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
+    if not color and (colored := sum(clouds[t].color is not None for t in kept)):
+        notes[UNREAD_COLORS] = colored
     frames = [clouds[t].points for t in kept]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor

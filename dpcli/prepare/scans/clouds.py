@@ -103,7 +103,7 @@ class CloudFolders(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        items, told = [], {"color": self._has_color, "timed": self._timed}
+        items, told = [], {"color": self._has_color, "timed": self._timed, "unread": self._first[1]}
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, series.folder, extra={**told, "series": series}))
@@ -119,7 +119,7 @@ class CloudFolders(OwnScans):
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= notes
+        sample.notes |= notes | _further(clouds, item.extra["unread"])
         return sample
 
     def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:
@@ -143,6 +143,15 @@ class CloudFolders(OwnScans):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
         lines += about_series([(item.name, item.extra["series"]) for item in items])
         return lines + (self._table.unnamed(items) if self._table else [])
+
+
+def _further(clouds: list[Cloud], known: tuple[str, ...]) -> dict[str, int]:
+    """Returns a note of how many frames have columns that are not read, and that the first of all, which was told, has not."""
+    further = [names for cloud in clouds if (names := without(cloud.unread, known)) and len(cloud.points)]
+    if not further:
+        return {}
+    names = first_names(list(dict.fromkeys(name for one in further for name in one)), _LISTED)
+    return {f"frames with further columns ({names}), which are not read": len(further)}
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:

@@ -11,6 +11,7 @@ import pytest
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.scans.assembling import UNREAD_COLORS
 from dpcli.prepare.scans.cloud_series import find_sequences
 from dpcli.prepare.scans.clouds import CloudFolders
 
@@ -84,6 +85,16 @@ def test_a_frame_without_the_others_colors_is_refused(tmp_path):
     save(tmp_path / "1.ply")
     with pytest.raises(DataError, match=r"1.ply: no colors"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npz", ".las"])
+def test_what_later_frames_alone_have_is_told(tmp_path, suffix):
+    save(tmp_path / f"0{suffix}", color=0 * COLOR if suffix == ".las" else None)
+    save(tmp_path / f"1{suffix}", color=COLOR)
+    (tmp_path / "2.csv").write_text("x,y,z,snr\n1,2,3,4\n1,2,4,4\n")
+    assert read(tmp_path, pattern=f"*{suffix}").notes == {UNREAD_COLORS: 1}
+    (tmp_path / "1.csv").write_text("x,y,z\n1,2,3\n1,2,4\n")
+    assert read(tmp_path, pattern="*.csv").notes == {"frames with further columns (snr), which are not read": 1}
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".bin", ".csv", ".xyz"])
