@@ -214,7 +214,7 @@ class ArraySequences(OwnScans):
         with open_arrays(item.path) as arrays:
             beside, axes = self._beside(item.path, arrays, source)
             frames = _frames(item.path, arrays, source, axes)
-            colors = _cut(arrays[beside.colors], axes, source.place) if item.extra["color"] and beside.colors else None
+            colors = _cut(arrays[beside.colors], axes, source.place) if beside.colors else None
             kept = {name: self._column(item.path, arrays, name, source, axes) for name in self.keep}
             time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(arrays, beside, axes, source, frames)

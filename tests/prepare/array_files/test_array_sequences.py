@@ -180,6 +180,13 @@ def test_frames_of_unlike_sizes(tmp_path):
         assert same(found, frames), name
 
 
+def test_colors_that_the_first_file_lacks_are_told(tmp_path, capsys):
+    for name, more in (("a", {}), ("b", {"colors": np.zeros((5, 30, 3), np.uint8)})):
+        write(tmp_path / "raw" / name, "npz", points=untracked(13, 5, 30), **more)
+    assert len(read(tmp_path / "raw")) == 2
+    assert "frames with colors, which are not read, as the first of all has none: 5" in capsys.readouterr().err
+
+
 def test_numbers_of_points_that_are_not_read_are_counted(tmp_path, capsys):
     frames = [np.random.default_rng(count).normal(size=(count, 6)) for count in range(20, 30)]
     cell = np.empty(10, object)
