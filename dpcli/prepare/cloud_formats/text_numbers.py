@@ -367,14 +367,16 @@ def _rough_cells(line: str) -> list[str]:
 
 
 def _delimiter(line: str) -> str | None:
-    """Returns what separates the cells of a row; None for blanks. Commas between blanks are decimal ones."""
+    """Returns what separates the cells of a row; None for blanks. Commas between blanks are decimal ones, but for those behind
+    all cells but the last.
+    """
     if sign := next((d for d in "\t;|" if d in line), None):
         return sign
     if "," not in line:
         return None
-    words = line.split()
-    decimal = len(words) >= 3 and all(re.fullmatch(_NUMBER, word) for word in words)
-    return None if decimal else ","
+    *words, last = line.split()
+    decimal = len(words) >= 2 and all(re.fullmatch(_NUMBER, word) for word in (*words, last))
+    return None if decimal and not all(word.endswith(",") for word in words) else ","
 
 
 def _without_count(table: TextTable, counted: tuple[int, str], *_: tuple[int, str]) -> TextTable:

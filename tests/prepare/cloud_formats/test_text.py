@@ -293,6 +293,13 @@ def test_rows_of_nothing_are_dropped_and_counted(tmp_path, sign, columns, word):
         assert read(tmp_path / "a.csv", "\n".join([rows[0], rows[-1], rows[-1]])).dropped == {EMPTY: 2}
 
 
+@pytest.mark.parametrize("first", ["0, 0, 0", "1, 2, 3", "-1, 20, 300", "1000, 2, 3"])
+def test_a_first_row_of_whole_numbers_between_commas_and_blanks(tmp_path, first):
+    points = [[float(number) for number in first.split(", ")], *POINTS]
+    text = "".join(", ".join(map(repr, point)) + "\n" for point in POINTS)
+    np.testing.assert_allclose(read(tmp_path / "a.xyz", f"{first}\n{text}").points, points)
+
+
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):
     assert read(tmp_path / "a.csv", "frame,x,y,z\n7,1,2,3\n7,4,5,6\n").points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
