@@ -116,7 +116,8 @@ def _axis(name: str) -> tuple[int, int, str] | None:
     rest = rest[:-1] if first_return else rest
     letters = [word for word in rest if word in ("x", "y", "z")]
     others = [word for word in rest if word not in ("x", "y", "z")]
-    if len(letters) != 1 or not set(others) <= _ABOUT_POINTS:
+    turned = re.match(r"\W*[-\u2212]", name)  # "-y" holds the opposite of y
+    if turned or len(letters) != 1 or not set(others) <= _ABOUT_POINTS:
         return None
     return "xyz".index(letters[0]), 2 if others or first_return else 1 if unit else 0, unit
 

@@ -385,5 +385,6 @@ def test_colors_in_one_column_and_in_percent(tmp_path, header, cell, color):
 
 def test_names_that_mean_something_else():
     assert find_axes(["vx", "vy", "vz"]) is None and find_axes(["x", "y", "range"]) is None
+    assert find_axes(["x", "-y", "z"]) is None and find_axes(["-x [m]", "\u2212y [m]", "z [m]"]) is None
     assert find_colors(["r", "azimuth", "g"]) == [] and find_colors(["x", "Red", "Green", "Blue"]) == [1, 2, 3]
     assert find_frame_column(["scan", "frame_id", "x"]) == "frame_id" and find_frame_column(["x", "time"]) is None
