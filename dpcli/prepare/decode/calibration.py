@@ -24,7 +24,7 @@ from dpcli.prepare.decode.calibration_texts import (
 )
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.store.schema import METERS
-from dpcli.text_files import check_depth, parse_json
+from dpcli.text_files import check_depth, decode_text, parse_json
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
 _CX = ("cx", "ppx", "c_x", "mx_depth")
@@ -77,8 +77,8 @@ def read_calibration(path: Path) -> Calibration:
     if path.suffix.lower() == ".mat" and path.is_file():
         raise DataError(f"{path}: {MATLAB_ADVICE}")
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
+        text = decode_text(path)
+    except DataError:
         raise DataError(f"{path}: is not text; {_EXPECTED}") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
@@ -146,7 +146,7 @@ def _of_lines(path: Path, text: str) -> dict[str, Any]:
 def _yaml(path: Path, text: str) -> Any:
     import yaml
 
-    plain = re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
+    plain = re.sub(r"^%YAML.*$|!!opencv-(nd-)?matrix", "", text, flags=re.MULTILINE)
     try:
         data = next((part for part in yaml.safe_load_all(plain) if part), None)
     except RecursionError:
@@ -272,6 +272,10 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
     numbers = _pixels(path, own)
     lens = _lens(path, own)
     size = _resolution(path, own, numbers[2:])
+    roi = own.get("roi")  # of ROS: what is cut out of the picture that the numbers are for; none where its size is 0
+    cut = [roi.get(key) for key in ("x_offset", "y_offset", "width", "height")] if isinstance(roi, dict) else []
+    if cut and _are_numbers(cut) and all(cut[2:]):
+        numbers[2:], size = [numbers[2] - cut[0], numbers[3] - cut[1]], _pixel_counts(path, *cut[2:])
     scale = _depth_scale(path, own, data)
     return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
 
@@ -347,6 +351,8 @@ def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[i
     puts the principal point ``center`` nearer to the middle.
     """
     size = next((value for key, value in own.items() if _SIZE.match(_letters(key))), None)
+    if isinstance(size, dict) and "data" in size:  # OpenCV's lists
+        size = size["data"]
     if isinstance(size, dict):
         return _resolution(path, {str(key).lower(): value for key, value in size.items()}, center)
     if isinstance(size, str):

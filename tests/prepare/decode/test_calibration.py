@@ -275,6 +275,32 @@ def test_a_lens_is_read_however_it_is_written(tmp_path, said):
     assert read_calibration(tmp_path / "k.json").intrinsics.distortion == (0.1, -0.05, 0.001, -0.002, 0.01)
 
 
+@pytest.mark.parametrize("binning", [0, 2])
+def test_what_ros_cuts_out_of_a_picture_is_taken_off(tmp_path, binning):
+    roi = {"x_offset": 100, "y_offset": 40, "width": 320, "height": 240, "do_rectify": False}
+    told = {"width": 640, "height": 480, "K": ROWS, "D": [0] * 5, "binning_x": binning, "binning_y": binning}
+    (tmp_path / "k.yaml").write_text(json.dumps({**told, "roi": roi}))
+    found = read_calibration(tmp_path / "k.yaml")
+    assert found.of_pictures(320, 240) == Intrinsics(FX, FY, CX - 100, CY - 40)
+    assert found.of_pictures(160, 120).fx == FX / 2
+    (tmp_path / "k.yaml").write_text(json.dumps({**told, "roi": dict.fromkeys(roi, 0)}))
+    assert read_calibration(tmp_path / "k.yaml").of_pictures(640, 480) == CAMERA
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "latin-1"])
+@pytest.mark.parametrize("text", [f"# für Räume\nK: {ROWS}\n", f"%YAML:1.0\n# für Räume\n---\nK: {ROWS}\n"])
+def test_calibrations_in_other_encodings(tmp_path, encoding, text):
+    (tmp_path / "k.yaml").write_bytes(text.encode(encoding))
+    assert read_calibration(tmp_path / "k.yaml").intrinsics == CAMERA
+
+
+def test_lists_as_opencv_5_writes_them(tmp_path):
+    more = "imageSize: !!opencv-nd-matrix\n   sizes: [ 2 ]\n   dt: i\n   data: [ 640, 480 ]\n"
+    (tmp_path / "k.yml").write_text(OPENCV.replace("image_width: 640\nimage_height: 480\n", more))
+    found = read_calibration(tmp_path / "k.yml")
+    assert (found.intrinsics, found.width, found.height) == (CAMERA, 640, 480)
+
+
 def test_the_info_of_scannets_recordings(tmp_path):
     matrices = f"m_calibrationColorIntrinsic = 900 {FOUR[5:]}".replace("\n", " ")
     text = f"m_depthWidth = 640\nm_depthHeight = 480\nm_depthShift = 1000\n{matrices}\n"
@@ -351,7 +377,7 @@ def test_numbers_that_no_camera_has_are_refused_or_not_used(tmp_path, name, cont
 
 
 def test_a_file_that_is_missing_or_no_text(tmp_path):
-    (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00\x80")
+    (tmp_path / "k.json").write_bytes(bytes(range(256)))
     for name, message in (("none.json", "cannot be read"), ("k.json", "is not text")):
         with pytest.raises(DataError, match=message):
             read_calibration(tmp_path / name)
