@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.text_files import parse_json
+from dpcli.text_files import decode_text, parse_json
 
 SUFFIXES = (".csv", ".json")  # of the files
 _NEEDED = ("recording", "start", "end", "class")
@@ -100,11 +100,11 @@ def read_segments(path: str | Path, text: str | None = None) -> Segments:
 
 def _text_of(path: Path) -> str:
     try:
-        text = path.read_text("utf-8-sig")
+        text = decode_text(path)
         if "\0" in text:
             raise UnicodeError
         return text
-    except UnicodeError:
+    except (DataError, UnicodeError):
         raise DataError(f"{path}: no text; expected segments as .csv or .json") from None
     except OSError as error:
         raise DataError(f"{path}: can't be read ({error.strerror})") from None

@@ -73,6 +73,13 @@ def test_tables_of_other_programs_are_read_alike(tmp_path, divider):
     assert found == [(0, 10, "wave"), (10, 12, "")]
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "latin-1"])
+def test_tables_in_other_encodings_are_read_alike(tmp_path, encoding):
+    (tmp_path / "t.csv").write_bytes("recording;start;end;class\nJürgen;0;10;drücken\n".encode(encoding))
+    found = read_segments(tmp_path / "t.csv").recordings
+    assert [(name, own.start, own.end, own.name) for name, (own,) in found.items()] == [("Jürgen", 0, 10, "drücken")]
+
+
 def test_a_row_with_more_cells_than_columns_is_named(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("recording,start,end,class\na,0,10,wave\na,10,20,bow, deep\n")
