@@ -147,7 +147,7 @@ class Sapien:
                 f.path,
                 split=split,
                 label=names.index(f.category) if f.category else -1,
-                extra={"parts": pad},
+                extra={"parts": pad, "first": number == 0},
                 problem=problem,
             )
             for f, split, problem in zip(found, splits, problems)
@@ -157,6 +157,8 @@ class Sapien:
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(item.path, self.root, self.articulation)
+        if not item.extra["first"]:  # what is odd in an object counts once, not once a sequence
+            studied = replace(studied, notes=Counter())
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:

@@ -23,6 +23,10 @@ _TYPES = (*MOVABLE, "fixed", *_UNSUPPORTED)
 _TURNS = "hinges with limits more than two turns apart (one turn taken; are they degrees? a URDF has radians)"
 _DEGREES = "origins turned by more than one turn (are they degrees? a URDF has radians)"
 _LARGEST = 1e9  # of all numbers but limits, which may be as large as a float for none
+_LARGE = 20.0  # meters, of a mesh
+_MILLIMETERS = (
+    f"meshes larger than {_LARGE:g} m (are they in millimeters? a URDF has meters; scale in <mesh> changes them)"
+)
 _EQUAL = "joints whose two limits are equal taken as fixed (as SolidWorks exports joints without limits)"
 
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
@@ -83,6 +87,8 @@ def load_object(skeleton: Skeleton) -> ArticulatedObject:
         corners = geometry_triangles(skeleton.path, geometry, skeleton.root, notes)
         if not len(corners):
             notes["mesh files without faces"] += 1
+        elif geometry.mesh is not None and np.ptp(corners, axis=(0, 1)).max() > _LARGE:
+            notes[_MILLIMETERS] += 1
         triangles.append(corners @ placement[:3, :3].T + placement[:3, 3])
         bodies.append(np.full(len(corners), body, np.int64))
     kept = drop_degenerate(np.concatenate(triangles), np.concatenate(bodies), notes)
@@ -129,6 +135,8 @@ def _parse(path: Path, notes: Counter) -> Any:
         if isinstance(error, KeyError | IndexError):
             raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
         problem = getattr(error, "msg", None) or error
+        if "xacro" in str(problem):  # the prefix of its elements is not declared
+            raise DataError(f"{path}: {_XACRO}") from None
         hint = "; save it as UTF-8, or name its encoding in its first line" if "ncoding" in str(problem) else ""
         raise DataError(f"{path}: not well-formed XML ({problem}); expected a URDF{hint}") from None
     except Exception as error:  # an element or attribute that is absent or odd: one bad file must not end the others

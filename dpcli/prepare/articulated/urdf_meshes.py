@@ -49,7 +49,8 @@ def _solid(geometry: Any) -> Any:
             return trimesh.creation.capsule(length, radius, (24, 48))
         return trimesh.creation.cylinder(radius, length, sections=48)
     if geometry.sphere is not None:
-        return trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
+        with np.errstate(invalid="ignore"):  # of no size, as some links have that are only a place
+            return trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
     return None
 
 

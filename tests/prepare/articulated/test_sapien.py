@@ -197,9 +197,13 @@ def test_not_xml_and_not_urdf(tmp_path):
     path.write_text("<robot name='r'><link")
     with pytest.raises(DataError, match="not well-formed XML"):
         read_skeleton(path)
-    path.write_text("<sdf/>")
-    with pytest.raises(DataError, match="its root element is <sdf>; expected <robot>"):
-        read_skeleton(path)
+    for text, words in (
+        ("<sdf/>", "its root element is <sdf>; expected <robot>"),
+        ("<robot><xacro:include filename='a'/></robot>", "it is written in xacro"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=words):
+            read_skeleton(path)
 
 
 def test_meshes_that_cannot_be_used(tmp_path):
@@ -358,6 +362,21 @@ def test_collada_is_read_in_meters_whatever_unit_it_declares(meter, name):
             shape = f'<mesh filename="b.dae" scale="{scale}"/>'
             path = write_urdf(Path(folder, "r.urdf"), link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b"))
             assert load(path).body_areas == pytest.approx([area, 6], rel=1e-4)
+
+
+def test_what_is_odd_in_an_object_counts_once_not_once_a_sequence(tmp_path):
+    two(tmp_path, link("c", box(1, 1, 1)), joint("k", "a", "c", kind="planar"))
+    few = ("--sequences-per-object", 3, "--frames", 2, "--points", 32)
+    done = dpc("prepare", "sapien", tmp_path / "r.urdf", "-o", tmp_path / "o.h5", *few)
+    assert "3 sequences" in done.stdout and "planar joints taken as fixed: 1\n" in done.stderr
+
+
+def test_meshes_in_millimeters_are_told(tmp_path):
+    for scale, told in ((1, True), (0.001, False)):
+        cube = f'<mesh filename="cube.obj" scale="{" ".join([str(30 * scale)] * 3)}"/>'
+        (tmp_path / "cube.obj").write_text(CUBE_OBJ)
+        path = write_urdf(tmp_path / "r.urdf", link("a", cube), link("b", box(1, 1, 1)), joint("j", "a", "b"))
+        assert any("are they in millimeters?" in note for note in load(path).notes) is told
 
 
 @pytest.mark.parametrize(
