@@ -123,3 +123,7 @@ def test_pictures_of_a_clip_have_their_times(tmp_path, capfd):
     assert "its frames have the times in times.txt" in said and "assumed" not in said
     with ViewsReader(tmp_path / "v.h5") as reader:
         np.testing.assert_allclose(reader.header.time, SECONDS, atol=1e-5)
+    (tmp_path / "times.txt").write_text("0\n0.1\n")
+    assert exit_code("prepare", "video", tmp_path, "-o", tmp_path / "w.h5", "--size", 32) == 0
+    said = capfd.readouterr().err
+    assert "left out: times.txt (2 times for 6 frames)" in said and "16 per second assumed" in said

@@ -177,9 +177,12 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     if any(a >= b for a, b in zip(numbers, numbers[1:])):
         numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3
     names = tuple(path.name for path in paths)
-    beside = with_times(Series(folder, names, pattern), folder).beside
+    timed = with_times(Series(folder, names, pattern), folder)
+    beside = timed.beside
     if beside and not quiet:
         log.info(f"{folder}: its frames have the times in {beside.path.name}")
+    for unfit in () if quiet else timed.left_out:
+        log.info(f"{folder}: left out: {unfit}")
     return Frames(folder, names, tuple(numbers), tuple(paths), tuple(beside.seconds.tolist()) if beside else None)
 
 
