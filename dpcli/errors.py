@@ -10,6 +10,9 @@ from contextlib import contextmanager
 _ADDRESS = re.compile(r"<([\w.]+) object at 0x[0-9a-fA-F]+>")
 
 
+REORDER = "`dpc prepare merge FILE --labels map.toml -o NEW.h5` puts them in the order of `classes` in the map"
+
+
 class DpcError(Exception):
     """The work failed (exit code 1).
 

@@ -9,7 +9,7 @@ from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import REORDER, DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
@@ -72,9 +72,10 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
     if reader.class_names and reader.class_names != info.class_names:
         pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
-        raise DataError(
-            f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes"
-        )
+        why = "the model was trained for other classes"
+        if {*reader.class_names} <= {*info.class_names}:
+            why = f"it has these classes at other places; {REORDER}"
+        raise DataError(f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; {why}")
 
 
 def report_backward(reader: CloudsReader, sequences: list[int]) -> None:

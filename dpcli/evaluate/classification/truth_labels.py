@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError
+from dpcli.errors import REORDER, DataError
 from dpcli.evaluate.results import LeftOut, counted_split, list_names
 from dpcli.store import CloudsReader, ScoresReader
 
@@ -89,4 +89,5 @@ def _check_classes(scores: ScoresReader, truth: str | Path, class_names: Sequenc
         )
     pairs = enumerate(zip(class_names, scores.class_names, strict=True))
     label, (ours, theirs) = next(pair for pair in pairs if pair[1][0] != pair[1][1])
-    raise DataError(f"{truth}: class {label} is {ours!r}, in {scores.path} it is {theirs!r}")
+    advice = f"; {REORDER}" if {*class_names} == {*scores.class_names} else ""
+    raise DataError(f"{truth}: class {label} is {ours!r}, in {scores.path} it is {theirs!r}{advice}")

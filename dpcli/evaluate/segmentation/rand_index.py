@@ -8,7 +8,9 @@ from dpcli.evaluate.segmentation.part_overlap import overlap, valid_points
 
 
 def rand_index(truth: np.ndarray, part: np.ndarray, *, ignore_below: int = 0) -> float:
-    """Returns the share of ordered point pairs, a point with itself among them, on which "same part" agrees (Rand 1971).
+    """Returns the share of ordered point pairs, a point with itself among them, on which "same part" agrees.
+
+    So has OGC's code; the index of Rand 1971 has no such pairs and is lower by (1 - it) / N.
 
     Ids i (N) each. Predicted -1 is one more group; unknown points and those of true parts of fewer than `ignore_below`
     points are taken out. NaN when nothing is left.

@@ -141,7 +141,7 @@ def test_unscored_samples_of_another_split_are_fine(scores: Path, tmp_path: Path
 
 def test_truth_with_other_classes_names_the_first(scores: Path, tmp_path: Path) -> None:
     labels = dict.fromkeys("abcdef", 0)
-    with pytest.raises(DataError, match="class 1 is 'pull', in .* it is 'push'"):
+    with pytest.raises(DataError, match="class 1 is 'pull', in .* it is 'push'; `dpc prepare merge"):
         evaluate_classification(scores, write_truth(tmp_path / "t.h5", labels, ("wave", "pull", "push")))
     with pytest.raises(DataError, match="4 classes, but .* scores 3"):
         evaluate_classification(scores, write_truth(tmp_path / "u.h5", labels, (*NAMES, "more")))
