@@ -34,6 +34,7 @@ _BT709 = (
 )
 _ROOM = 64 << 10  # bytes: with less a disk counts as full, as encoders write whole buffers
 _COLORS = 255  # of an animation
+_GIF_RATE = 50
 _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
 
@@ -142,8 +143,14 @@ def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     whole = list(pictures)
     table = _color_table(np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1))
     images = [Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE) for picture in whole]
-    pause = max(2, round(100 / fps)) * 10  # milliseconds; GIF counts in hundredths and players slow down below two
-    images[0].save(path, save_all=True, append_images=images[1:], duration=pause, loop=0, disposal=1)
+    # GIF counts in hundredths of a second, and players slow down below two
+    ends = np.arange(len(images) + 1) * max(2.0, 100 / fps)
+    pauses = (np.diff(np.rint(ends)) * 10).astype(int).tolist()
+    if fps > _GIF_RATE:
+        log.warn(
+            f"an animation shows at most {_GIF_RATE} pictures a second: it takes {fps / _GIF_RATE:.3g} times as long"
+        )
+    images[0].save(path, save_all=True, append_images=images[1:], duration=pauses, loop=0, disposal=1)
 
 
 def _color_table(picture: np.ndarray) -> Image.Image:

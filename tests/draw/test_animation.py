@@ -57,6 +57,17 @@ def test_animation_folder_and_picture(tmp_path):
         np.testing.assert_array_equal(np.asarray(Image.open(path)), moving_square()[number])
 
 
+@pytest.mark.parametrize(("fps", "seconds"), [(24, 1.0), (30, 0.8), (7.5, 3.2), (60, 0.48)])
+def test_an_animation_lasts_as_long_as_asked_for_or_says_that_it_cannot(tmp_path, capsys, fps, seconds):
+    from PIL import Image
+
+    write_pictures(tmp_path / "a.gif", iter(moving_square(24, (31, 120))), fps=fps)
+    with Image.open(tmp_path / "a.gif") as image:
+        pauses = [image.seek(frame) or image.info["duration"] for frame in range(image.n_frames)]
+    assert sum(pauses) / 1000 == pytest.approx(seconds)
+    assert ("at most 50 pictures a second: it takes 1.2 times as long" in capsys.readouterr().err) is (fps > 50)
+
+
 def test_nothing_half_made_stays(tmp_path):
     def breaking():
         yield from moving_square(2)
