@@ -96,6 +96,16 @@ class GaussianScene:
         """Returns the color that doesn't depend on the direction, u8 (N,3)."""
         return color_of(self.sh)
 
+    def require_times(self, asked: np.ndarray, path: object, asker: str) -> None:
+        """Raises DataError where times f64 (n), seconds, lie outside the clip by more than half a frame: nothing is known then.
+
+        path: of the scene; asker: what asks for these times, in words.
+        """
+        own = self.time
+        slack = 0.5 * min((np.diff(t).min() for t in (own, asked) if len(t) > 1), default=np.inf)
+        if asked[0] < own[0] - slack or asked[-1] > own[-1] + slack:
+            raise DataError(f"{path}: holds {own[0]:.4g} to {own[-1]:.4g} s, but {asker}")
+
     def between(self, time: float) -> tuple[int, int, float]:
         """Returns (a, b, w): the frames around `time` (seconds), and the weight 0..1 of the later one; clamped at the ends."""
         if not np.isfinite(time):

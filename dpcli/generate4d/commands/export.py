@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.export import (
@@ -53,6 +55,8 @@ def export_scene(
         scene, (root, history) = read_scene(place), scene_origin(place)
         config = {"as": form, "axes": axes, "min_opacity": min_opacity, "points": points}
         entry = provenance.record(config, seed, {"gaussians": place}) if form == "clouds" else {}
+    if time is not None:
+        scene.require_times(np.array([time]), scene_file, f"--time is {time:g}")
     if form == "clouds":
         name, least = str(root["source"]) or "scene", _CLOUD_OPACITY if min_opacity is None else min_opacity
         sequence = as_sequence(scene, name, min_opacity=least, points=points, rng=generator(seed), axes=axes)

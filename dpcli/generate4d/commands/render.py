@@ -25,6 +25,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.whole_file import check_target
 from dpcli.store import ViewsReader, input_file, output_file
 from dpcli.store.gaussians import read_scene, scene_origin
+from dpcli.store.views import ViewsHeader
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _SHEET_SIDE = 160  # pixels of its pictures
@@ -52,9 +53,15 @@ def render_scene(
         scene, (root, history) = read_scene(place), scene_origin(place)
         config = {"cameras": bool(cameras), "color": settings.color, "trajectories": settings.trajectories}
         entry = provenance.record(config, int(root["seed"]), {"gaussians": place})
+    if settings.time is not None:
+        scene.require_times(np.array([settings.time]), scene_file, f"--time is {settings.time:g}")
     renderer = Renderer(scene, choose_device(device))
     if cameras is not None:
-        _render_views(renderer, look, cameras, str(output), [*history, entry], root, force)
+        with ViewsReader(cameras) as reader:
+            header = reader.header
+        span = f"{header.time[0]:.4g} to {header.time[-1]:.4g} s; was it fitted to another clip?"
+        scene.require_times(header.time, scene_file, f"{cameras} has frames from {span}")
+        _render_views(renderer, look, header, str(output), [*history, entry], root, force)
     elif output is not None:
         _render_path(renderer, look, Path(output), settings, force)
     if picture is not None:
@@ -97,14 +104,19 @@ def _render_path(renderer: Renderer, look: Look, output: Path, settings: RenderS
                 progress.advance()
 
         write_pictures(output, draw(), settings.fps or default_rate(renderer.scene, path), force=force)
-    log.info(f"{output}: {counted(len(shots), 'picture')} of {shots[0].size[0]} x {shots[0].size[1]}")
+    width, height = (side + side % 2 if kind == ".mp4" else side for side in shots[0].size)  # as H.264 needs them
+    log.info(f"{output}: {counted(len(shots), 'picture')} of {width} x {height}")
 
 
 def _render_views(
-    renderer: Renderer, look: Look, cameras: Path, output: str, history: list[dict], root: dict[str, Any], force: bool
+    renderer: Renderer,
+    look: Look,
+    header: ViewsHeader,
+    output: str,
+    history: list[dict],
+    root: dict[str, Any],
+    force: bool,
 ) -> None:
-    with ViewsReader(cameras) as reader:
-        header = reader.header
     with output_file(output) as place:
         render_views(
             renderer,

@@ -260,6 +260,10 @@ def test_single_files_and_an_instant(scene_file, tmp_path):
     )
     with pytest.raises(UsageError, match="--force"):
         export_scene(str(scene_file), str(tmp_path / "a.ply"), time=None, **usual)
+    for time in (-1.0, 99.0):
+        with pytest.raises(DataError, match=rf"holds 0 to [\d.]+ s, but --time is {time:g}"):
+            export_scene(str(scene_file), str(tmp_path / "b.ply"), time=time, **usual)
+    assert not (tmp_path / "b.ply").exists()
 
 
 def test_an_export_flows_into_the_segmenter(dpc, dpc_here, scene_file, tmp_path):

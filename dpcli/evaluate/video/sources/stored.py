@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View, mean_rate
 from dpcli.store.views import ViewsHeader, ViewsReader
 
@@ -57,13 +56,9 @@ class SceneSource(Source):
         self._check_times(truth)
 
     def _check_times(self, truth: Path) -> None:
-        own, asked = self.scene.time, self.header.time
-        slack = 0.5 * min((np.diff(t).min() for t in (own, asked) if len(t) > 1), default=np.inf)
-        if asked[0] < own[0] - slack or asked[-1] > own[-1] + slack:
-            raise DataError(
-                f"{self.path}: holds {own[0]:.4g} to {own[-1]:.4g} s, but {truth} has frames from "
-                f"{asked[0]:.4g} to {asked[-1]:.4g} s; was it fitted to another clip?"
-            )
+        asked = self.header.time
+        span = f"{truth} has frames from {asked[0]:.4g} to {asked[-1]:.4g} s; was it fitted to another clip?"
+        self.scene.require_times(asked, self.path, span)
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
         """Yields the frames of a view, rendered."""
