@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -116,6 +116,8 @@ class DepthVideos:
             raise UsageError(f"--fps {self.fps:g}: expected more than 0")
         if (self.intrinsics or self.calibration) and self.fov is not None:
             raise UsageError("--fov and intrinsics were both given; use one")
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise UsageError(f"--fov {self.fov:g}: expected degrees, more than 0 and below 180")
         if self.labels and self.label_from_folder:
             raise UsageError("--labels and --label-from-folder were both given; use one")
 
@@ -273,6 +275,10 @@ class DepthVideos:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{counted(len(items), 'depth video')} found"]
+        if unread := [
+            one for given in self.inputs for one in _not_read(given, {path for path, _, _ in self._chosen[0]})
+        ]:
+            lines.append(f"not read: {first_names(unread)}")
         if left_out := self._chosen[1]:
             lines.append(f"left out, by their names beside depth: {first_names(left_out)}")
         unknown = not (self.intrinsics or self.calibration or self.fov)
@@ -308,7 +314,11 @@ def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:
         for part in (path, *path.parents):
             siblings.setdefault(part.parent, set()).add(part.stem)
     with_depth = {folder for folder, names in siblings.items() if any(says_depth(name) for name in names)}
-    frames = {(path.parent, series.stems) for path, series in videos.items() if series and says_depth(path.stem)}
+    frames = {  # "d" alone may be the fourth take
+        (path.parent, series.stems)
+        for path, series in videos.items()
+        if series and says_depth(path.stem) and "depth" in path.stem.lower()
+    }
     return {
         path
         for path, series in videos.items()
@@ -318,6 +328,21 @@ def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:
         )
         or (series and not says_depth(path.stem) and len(series.names) > 1 and (path.parent, series.stems) in frames)
     }
+
+
+def _not_read(root: Path, clips: Collection[Path]) -> list[str]:
+    """Returns how many files outside of the clips may hold depth in formats that are not read, by folder, and the folders
+    that are empty. A phrase each.
+    """
+    told = []
+    for folder, below, names in walk_folders(root) if root not in clips else ():
+        where = "" if Path(folder) == root else f"{as_utf8(Path(folder).relative_to(root).as_posix())}/"
+        if where and not below and not any(not is_hidden(name) for name in names):
+            told.append(f"{where[:-1]} (empty)")
+        below[:] = [name for name in below if Path(folder, name) not in clips]
+        found = Counter(splitext(name)[1].lower() for name in names if name.lower().endswith(_FOREIGN))
+        told += [f"{where}{counted(count, f'{suffix} file')}" for suffix, count in sorted(found.items())]
+    return sorted(told, key=natural_key)
 
 
 def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None]]:

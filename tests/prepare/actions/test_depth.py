@@ -444,6 +444,7 @@ def test_folders_without_videos(tmp_path):
         {"depth_scale": 0},
         {"fps": -1},
         {"fov": 60, "intrinsics": CAMERA},
+        {"fov": 200},
     ],
 )
 def test_impossible_options(tmp_path, options):

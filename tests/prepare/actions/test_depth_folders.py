@@ -241,6 +241,24 @@ def test_a_folder_of_the_same_frames_beside_depth_is_no_other_video(tmp_path, be
     assert any(beside in line and "left out" in line for line in reader.summary(reader.items()))
 
 
+@pytest.mark.parametrize("names", ["abcde", ("wave_a", "wave_d"), ("axis y", "axis z"), ("D", "E")])
+def test_a_take_that_a_letter_counts_is_no_folder_of_depth(tmp_path, names):
+    for name in names:
+        write(tmp_path / "push" / name, **{f"{t:03}": depth(1000 + t) for t in range(3)})
+    reader = DepthVideos(inputs=(tmp_path,))
+    assert [item.name for item in reader.items()] == [f"push/{name}" for name in sorted(names)]
+
+
+def test_what_is_not_read_beside_the_videos_is_counted(tmp_path):
+    write(tmp_path / "a" / "good", **{"000": depth(1000), "001": depth(1001)})
+    write(tmp_path / "a" / "empty")
+    for name in ("a/jpegs/0.jpg", "a/jpegs/1.JPG", "clip.wmv", "a/good/0.zip", ".hidden/x.zip"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    lines = DepthVideos(inputs=(tmp_path,)).summary(DepthVideos(inputs=(tmp_path,)).items())
+    assert "not read: 1 .wmv file, a/empty (empty), a/jpegs/2 .jpg files" in lines
+
+
 def test_folders_of_people_beside_one_another_stay_videos_whatever_their_frames_are_called(tmp_path):
     for name in ("left", "right", "anna"):
         write(tmp_path / "v" / name, **{f"{t:03d}": depth(1000 + t) for t in (0, 1)})
