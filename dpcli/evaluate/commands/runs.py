@@ -11,13 +11,15 @@ from dpcli.evaluate.compare.result_json import runs_json
 from dpcli.evaluate.compare.runs import evaluate_runs
 from dpcli.evaluate.compare.runs_tables import runs_notes, runs_tables
 from dpcli.evaluate.results import Result
+from dpcli.store.pipes import refuse_repeats
 
 
 def run_runs(files: Sequence[str], options: EvaluationOptions, confidence: float) -> Result:
     """Returns the metrics of each file (one may be `-`: from a pipe), their mean, deviation and t interval.
 
-    Errors are those of `evaluate_runs`.
+    Errors are those of `evaluate_runs`, and UsageError where a file is named twice.
     """
+    refuse_repeats(files)  # a run that counts twice makes the spread too small
     with ExitStack() as stack:
         report = evaluate_runs(open_files(stack, files), options, confidence, files)
     return Result(runs_json(report), runs_tables(report), runs_notes(report))

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
-from dpcli.errors import DataError, DpcError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.compare.runs import mean_with_t_interval
 from tests.support.scores_helpers import write_scores
 
@@ -79,6 +79,8 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         run("runs", scores["good"], write_scores(tmp_path / "later.h5", set(), count=59))
     with pytest.raises(DataError, match="moved.h5: another samples than .*names_sha256"):
         run("runs", scores["good"], write_scores(tmp_path / "moved.h5", set(), start=3))
+    with pytest.raises(UsageError, match="good.h5: is named twice"):
+        run("runs", scores["good"], scores["close"], scores["good"])
     with pytest.raises(DataError, match="fewer.h5: has no 's0'"):
         run("runs", parts["good"], parts["fewer"], "--truth", parts["truth"])
     objects = {}
