@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,6 +148,9 @@ def _check_columns(path: str | Path, columns: Sequence[str]) -> None:
             f"{path}: no column {missing[0]!r}; expected a first line with {','.join(_NEEDED)} (it has "
             f"{','.join(columns)[:80] or 'none'})"
         )
+    twice = next((name for name in columns if name in _COLUMNS and columns.count(name) > 1), None)
+    if twice:
+        raise DataError(f"{path}: two columns {twice!r}; leave one of them out, or call it otherwise")
 
 
 def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
@@ -163,7 +167,8 @@ def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
         confidence = float(row.get("confidence") or "nan")
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{where}: confidence {row.get('confidence')!r}; expected a number") from None
-    return name, Segment(start, end, title.strip(), confidence)
+    name, title = (unicodedata.normalize("NFC", text) for text in (name, title.strip()))  # as macOS takes them apart
+    return name, Segment(start, end, title, confidence)
 
 
 def _whole(where: str, key: str, value: Any) -> int:

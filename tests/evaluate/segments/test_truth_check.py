@@ -80,6 +80,18 @@ def test_tables_in_other_encodings_are_read_alike(tmp_path, encoding):
     assert [(name, own.start, own.end, own.name) for name, (own,) in found.items()] == [("Jürgen", 0, 10, "drücken")]
 
 
+def test_letters_composed_in_two_ways_are_the_same(tmp_path):
+    (tmp_path / "t.csv").write_text("recording,start,end,class\nu\u0308,0,10,dru\u0308cken\n", encoding="utf-8")
+    ((name, (own,)),) = read_segments(tmp_path / "t.csv").recordings.items()
+    assert (name, own.name) == ("\u00fc", "dr\u00fccken")
+
+
+def test_a_column_that_is_there_twice_is_named(tmp_path):
+    (tmp_path / "t.csv").write_text("recording,start,end,class,Class\na,0,10,wave,bow\n")
+    with pytest.raises(DataError, match="two columns 'class'"):
+        read_segments(tmp_path / "t.csv")
+
+
 def test_a_row_with_more_cells_than_columns_is_named(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("recording,start,end,class\na,0,10,wave\na,10,20,bow, deep\n")
