@@ -108,14 +108,15 @@ class FramePass:
     def _common_frames(self, ours: int, theirs: int) -> int:
         """Returns how many frames of a pair of views are compared."""
         own, other = (s.frames[i] if s.frames else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
+        self.misnumbered = self.misnumbered or self._numbered_otherwise(ours, theirs)
         if own is None or own == other:
-            self.misnumbered = self.misnumbered or self._numbered_otherwise(ours, theirs)
             return int(other)
         if not self.intersect:
             title = self.truth.views[theirs].title
             raise DataError(
                 f"{self.predicted.path}: view {title!r} has {own} frames, {other} in {self.truth.path}; the first "
                 f"without a partner is frame {min(own, other)}; --intersect compares the first {min(own, other)}"
+                + (f", though their names number them otherwise ({self.misnumbered})" if self.misnumbered else "")
             )
         self.left_out.append(
             LeftOut(
@@ -130,7 +131,7 @@ class FramePass:
         own, other = (s.numbers[i] if s.numbers else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
         if own is None or other is None:
             return ""
-        odd = [k for k in range(1, len(own)) if own[k] - own[k - 1] != other[k] - other[k - 1]]
+        odd = [k for k in range(1, min(len(own), len(other))) if own[k] - own[k - 1] != other[k] - other[k - 1]]
         return f"{own[odd[0]]} with {other[odd[0]]}" if odd else ""
 
     def _frame_jobs(

@@ -185,7 +185,7 @@ def _surface_note(score: SurfaceScore) -> str:
 
 def _picture_notes(report: VideoReport) -> list[str]:
     choices, (width, height) = describe_protocol(report.protocol), report.size
-    counts = f"{counted(len(report.views), 'view')}, {_frames(report.views)} frames"
+    counts = f"{counted(len(report.views), 'view')}, {counted(int(_frames(report.views)), 'frame')}"
     lines = [
         f"{counts} of {width}x{height} pixels over {choices['background']}, {choices['colors']}, size: {choices['size']}; "
         f"data range {choices['data_range']}; means {choices['mean']}.",

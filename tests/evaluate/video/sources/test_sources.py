@@ -108,6 +108,8 @@ def test_clips_of_other_rates_are_told(tmp_path: Path) -> None:
         ([0, 10, 20, 30], [100, 110, 120, 130], ""),
         ([0, 1, 3, 4], [0, 1, 2, 3], "3 with 2"),
         ([0, 2, 4, 6], [0, 1, 2, 3], "2 with 1"),
+        ([0, 2, 4], [0, 1, 2, 3, 4, 5], "2 with 1"),
+        ([0, 1, 2], [0, 1, 2, 3], ""),
     ],
 )
 def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list, theirs: list, told: str) -> None:
@@ -115,8 +117,12 @@ def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list,
         (tmp_path / folder).mkdir()
         for number in own:
             Image.new("RGB", (16, 16), (number, 0, 0)).save(tmp_path / folder / f"v2_{number:04}_rgba.png")
-    notes = " ".join(evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",)).notes)
+    report = evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",), intersect=len(ours) != len(theirs))
+    notes = " ".join(report.notes)
     assert (f"({told})" in notes) if told else "number them otherwise" not in notes
+    if told and report.left_out:
+        with pytest.raises(DataError, match=rf"compares the first 3, though their names .*{told}"):
+            evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",))
 
 
 @pytest.mark.parametrize("digits", [1, 2, 5])
