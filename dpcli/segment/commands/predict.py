@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import UsageError
-from dpcli.path_names import file_names
+from dpcli.path_names import file_names, first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.machines.once_per_process import OncePerProcess
@@ -118,6 +118,9 @@ def predict_file(
         flow = str(estimator.resolve() if estimator else flow)
         work = PartsOfSequence(once, flow, refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
+        still = [reader.names[i] for i in sequences if reader.frame_counts[i] < 2]
+        if still and settings.classical.method == "multibody":
+            log.warn(f"{data}: one frame shows no motion: all is one part in {first_names(still)}")
         if force or not already_made(target, entry, PartsReader, WORK):
             for line in (
                 taken_for_meters(reader.path, reader.length_unit) if settings.classical.method == "scene" else ()

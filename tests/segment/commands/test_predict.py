@@ -56,6 +56,15 @@ def test_no_name_in_a_file_leads_out_of_the_folder_of_ply_files(dpc_here, tmp_pa
     assert found == ["ply/a_b_1/0000.ply", "ply/a_b_2/0000.ply", "ply/object/0000.ply"]
 
 
+def test_a_sequence_of_one_frame_is_told_to_be_one_part(dpc_here, tmp_path):
+    rng = np.random.default_rng(0)
+    with CloudsWriter(tmp_path / "c.h5", class_names=[]) as writer:
+        for name, frames in (("two", 2), ("one", 1)):
+            writer.write(CloudSequence.from_frames(name, [rng.random((200, 3), np.float32)] * frames))
+    done = dpc_here("segment", "predict", tmp_path / "c.h5", "-o", tmp_path / "p.h5")
+    assert done.returncode == 0 and "one frame shows no motion: all is one part in one\n" in done.stderr.decode()
+
+
 @pytest.mark.parametrize(
     "method, unit, warned", [("scene", "furlong", 1), ("scene", "cm", 0), ("multibody", "furlong", 0)]
 )
