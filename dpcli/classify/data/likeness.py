@@ -22,6 +22,7 @@ _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shap
 _SHIPPED = {"extent": 0.233, "frames": 76.0}  # MSR-Action3D's training videos: the shipped networks' files don't say it
 _ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
+_FINE = 1e-5  # of coordinates up to 100: what lies in one point there is not rounded to it
 _EXPECT = "; expect fewer right than in its training (another sensor?)"
 
 
@@ -59,7 +60,7 @@ def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
 
 def tell_rounded(what: str, found: dict[str, float]) -> None:
     """Warns where places are rounded so much, as float32 does far from the origin, that bodies lose their shape."""
-    if found.get("step", 0) > _ROUNDED * found.get("extent", np.inf):
+    if found.get("step", 0) > max(_ROUNDED * found.get("extent", np.inf), _FINE):
         log.warn(
             f"{what}: coordinates are so large, as on a map, that float32 rounds them to {found['step']:.2g}, while half of the"
             f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a nearby position before the file is"

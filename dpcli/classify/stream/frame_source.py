@@ -115,6 +115,8 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[
                 f"{where}: {shape[1]} numbers a point; the model reads {3 + len(columns)}: x, y, z, {', '.join(columns)}, in this"
                 " order"
             )
+        if number == 0 and shape[1] > 3 + len(columns):
+            log.info(f"{name}: arrays of {shape[1]} columns; the first 3 are read, as x, y, z")
         body = source.read(int(np.prod(shape)) * dtype.itemsize)
         if (cut := body.find(_MAGIC + b"\x01\x00")) >= 0:  # no coordinates look like this: the next frame begins here
             log.warn(

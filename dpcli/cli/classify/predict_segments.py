@@ -44,12 +44,13 @@ def predict_segments(
     from dpcli.classify.commands.segments import SegmentOptions as Options
     from dpcli.classify.commands.segments import counted
     from dpcli.classify.commands.segments import predict_segments as run
+    from dpcli.counted import counted as number
 
     found, text = run(task, Options(hop, window, shortest, reject))
     if task.output == "-":
         typer.echo(text, nl=False)
         return
     actions, nothing = counted(found.recordings)
-    typer.echo(
-        f"{task.output}: {actions} actions and {nothing} stretches of nothing in {len(found.recordings)} recordings"
-    )
+    stretches = number(nothing, "stretch of nothing", "stretches of nothing")
+    recordings = number(len(found.recordings), "recording")
+    typer.echo(f"{task.output}: {number(actions, 'action')} and {stretches} in {recordings}")

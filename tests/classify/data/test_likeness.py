@@ -48,6 +48,8 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
 def test_places_on_a_map_are_rounded(far, lost, capsys):
     tell_rounded("x", like(body(far=far)))
     assert ("float32 rounds them to 0.5" in capsys.readouterr().err) is lost
+    tell_rounded("x", like([np.ones((5, 3), np.float32)]))  # one point only, and no map
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

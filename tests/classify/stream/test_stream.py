@@ -274,6 +274,13 @@ def test_a_bad_frame_is_named(name):
         assert name == "HDF5" or f"frame {before}" in str(told.value)
 
 
+def test_columns_that_are_not_read_are_told_once(capsys):
+    wide = np.random.default_rng(0).random((5, 4)).astype(np.float32)
+    found = through_a_pipe(npy(wide) * 2)
+    np.testing.assert_array_equal(found, [wide[:, :3]] * 2)
+    assert capsys.readouterr().err.count("arrays of 4 columns; the first 3 are read, as x, y, z") == 1
+
+
 def test_a_growing_file_is_followed(tmp_path):
     frames = random_frames(6)
     content, path = as_stream(frames), tmp_path / "grows.npy"
