@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
+_FARTHEST = 300.0  # meters
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
@@ -114,6 +115,8 @@ class DepthVideos:
             raise UsageError(f"--depth-scale {self.depth_scale:g}: expected raw units per meter, more than 0")
         if self.fps is not None and not self.fps > 0:
             raise UsageError(f"--fps {self.fps:g}: expected more than 0")
+        if not self.margin >= 0:
+            raise UsageError(f"--margin {self.margin:g}: expected meters, 0 or more")
         if (self.intrinsics or self.calibration) and self.fov is not None:
             raise UsageError("--fov and intrinsics were both given; use one")
         if self.fov is not None and not 0 < self.fov < 180:
@@ -196,11 +199,14 @@ class DepthVideos:
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
+        seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
         points, counts = back_project(depth, camera, unit=unit, near=self.near, far=self.far)
+        if not counts.any() and (seen > 0).any():
+            raise DataError(f"{item.path}: {self._nothing_left(seen[seen > 0] / scale)}")
         require_plausible(str(item.path), points[:, 2], scale, asked=told)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         sequence = CloudSequence(
@@ -209,6 +215,13 @@ class DepthVideos:
         if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return Sample(sequence, {**notes, **dropped})
+
+    def _nothing_left(self, seen: np.ndarray) -> str:
+        """Returns which options took all that was seen, depths in meters."""
+        told = [f"--background {self.background} --margin {self.margin:g}"] if self.background != "none" else []
+        told += [f"--near {self.near:g} --far {self.far:g}"] if self.near > 0 or self.far < np.inf else []
+        span = f"{float(seen.min()):.4g} to {float(seen.max()):.4g} m"
+        return f"nothing is left of it; it sees depths of {span}, and {' and '.join(told)} (meters) takes all of them"
 
     def _video(self, item: Item) -> DepthVideo:
         """Returns the frames of an item, with the camera that a recording describes."""
@@ -289,6 +302,8 @@ class DepthVideos:
             )
         if self.calibration:
             lines += self.calibration.notes()
+        if _FARTHEST < self.far < np.inf:
+            lines.append(f"--far {self.far:g} cuts nothing, no depth camera sees so far; it is in meters")
         if not self._timed:
             silent = [item.name for item in items if not _tells_time(item)]
             lines.append(

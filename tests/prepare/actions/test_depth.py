@@ -437,6 +437,26 @@ def test_folders_without_videos(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            {"near": 500, "far": 4000},
+            "sees depths of 1.5 to 1.501 m, and --near 500 --far 4000 .meters. takes all of them",
+        ),
+        ({"background": "median", "margin": 50}, "--background median --margin 50 .meters. takes all"),
+        ({"background": "first", "far": 1.0}, "--background first --margin 0.05 and --near 0 --far 1"),
+    ],
+)
+def test_options_that_leave_nothing_are_named(tmp_path, options, words):
+    np.save(tmp_path / "a.npy", np.stack([np.full((6, 8), 1500 + t, np.uint16) for t in range(2)]))
+    reader = DepthVideos(inputs=(tmp_path,), **options)
+    (item,) = reader.items()
+    with pytest.raises(DataError, match=words):
+        reader.read(item, np.random.default_rng(0))
+    assert ("in meters" in str(reader.summary([item]))) is (options.get("far") == 4000)
+
+
+@pytest.mark.parametrize(
     "options",
     [
         {"near": 2, "far": 1},
@@ -445,6 +465,7 @@ def test_folders_without_videos(tmp_path):
         {"fps": -1},
         {"fov": 60, "intrinsics": CAMERA},
         {"fov": 200},
+        {"margin": -0.1},
     ],
 )
 def test_impossible_options(tmp_path, options):
