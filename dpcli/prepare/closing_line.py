@@ -13,6 +13,7 @@ _SEQUENCES, _FRAMES = 16, 3  # looked at, spread evenly: the line takes millisec
 _POINTS = 1 << 18
 _LONG_UNIT = 12  # letters of a unit that is told once only, behind the lengths
 _SHIFTS_SHOWN = 20
+_SAME = 1.05  # ratio of the rates of two sequences that have one
 _EVEN = 1.5  # ratio of two intervals between frames of which the longer one isn't a gap
 
 
@@ -64,16 +65,21 @@ def _frames(reader: CloudsReader) -> str:
     shown += " frame" if high == 1 else " frames"
     if "time" not in reader.fields:
         return shown + (" without times" if high > 1 else "")
-    steps = np.diff(reader.file["time"][:])
-    ends = np.cumsum(counts)[:-1] - 1
-    steps = np.delete(steps, ends[ends < len(steps)])
+    times, ends = reader.file["time"][:], np.cumsum(counts) - 1
+    steps = np.diff(times)
+    steps = np.delete(steps, ends[:-1][ends[:-1] < len(steps)])
     steps = steps[steps > 0]
     if not len(steps):
         return shown
     middle, least, most = float(median(steps)), float(steps.min()), float(steps.max())
     even = most < _EVEN * middle and middle < _EVEN * least
     apart = "" if even else f", {_number(least)} to {_number(most)} s apart"
-    return f"{shown} at {_number(1 / middle)} fps{apart}"
+    spans = times[ends[counts > 1]] - times[ends[counts > 1] - counts[counts > 1] + 1]
+    rates = (counts[counts > 1] - 1)[spans > 0] / spans[spans > 0]
+    rate = _number(1 / middle)
+    if rates.max(initial=0) >= _SAME * rates.min(initial=np.inf):  # the middle may be the rate of none
+        rate = f"{_number(rates.min())} to {_number(rates.max())}"
+    return f"{shown} at {rate} fps{apart}"
 
 
 def _shifts(reader: CloudsReader) -> list[str]:

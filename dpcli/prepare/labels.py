@@ -169,11 +169,12 @@ def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> No
         log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")
     for alike, count in Counter(map(_folded, class_names)).items():
         if count > 1:
-            log.warn(f"{path}: {' and '.join(n for n in class_names if _folded(n) == alike)} are different classes")
+            names = [n if n == n.strip() else repr(n) for n in class_names if _folded(n) == alike]
+            log.warn(f"{path}: {' and '.join(names)} are different classes")
 
 
 def _folded(name: str) -> str:
-    return _BETWEEN.sub(" ", unicodedata.normalize("NFKC", name).casefold())
+    return _BETWEEN.sub(" ", unicodedata.normalize("NFKC", name).casefold()).strip()
 
 
 def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:

@@ -187,6 +187,7 @@ def test_classes_that_are_hardly_meant_are_told(tmp_path, capsys, labels, said):
         (["data/wave/a", "data/push/b"], "one class, 'data'; if its folders are the classes (push, wave)"),
         (["anna/wave/1", "anna/push/1", "ben/wave/1", "ben/push/1"], "the classes are anna, ben; the folders below"),
         (["Wave/a", "wave/b"], "Wave and wave are different classes"),
+        (["wave /a", "wave/b"], "wave and 'wave ' are different classes"),
         (["wave/a", "push/a"], ""),
         (["wave/a/depth", "push/a/depth"], ""),
         (["wave/anna/1", "wave/ben/1", "push/anna/1"], ""),

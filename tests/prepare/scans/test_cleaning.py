@@ -16,7 +16,7 @@ from dpcli.prepare.scans.assembling import COARSE, Lengths, assemble
 from dpcli.prepare.scans.cleaning import AT_ORIGIN, CROWDED, IMPOSSIBLE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.runtime.machines.shards import Shard
-from dpcli.store import CloudsReader
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 POINTS = np.random.default_rng(1).uniform(0.5, 2, (20, 3))
 
@@ -139,6 +139,24 @@ def test_lengths_that_no_sensor_sees(tmp_path, points, doubt):
     assert any(doubt in note for note in notes) if doubt else not any("wide" in n or "around" in n for n in notes)
     reader = CloudFolders(tmp_path / "in", unit="mm")
     assert not any("--scale" in note for note in reader.read(reader.items()[0], np.random.default_rng(0)).notes)
+
+
+@pytest.mark.parametrize(
+    ("rates", "said"),
+    [
+        ([15, 30], "at 15 to 30 fps, 0.0333 to 0.0667 s apart"),
+        ([25, 24, 30, 30], "at 24 to 30 fps"),
+        ([30, 30.3], "at 30.1 fps"),
+        ([20], "at 20 fps"),
+    ],
+)
+def test_the_closing_line_names_no_rate_that_no_sequence_has(tmp_path, rates, said):
+    with CloudsWriter(tmp_path / "a.h5", class_names=[], fields=["time"]) as writer:
+        for number, rate in enumerate(rates):
+            frames = [np.ones((4, 3))] * 5
+            writer.write(CloudSequence.from_frames(str(number), frames, time=np.arange(5) / rate))
+        writer.write(CloudSequence.from_frames("one frame", [np.ones((4, 3))], time=np.zeros(1)))
+    assert closing_lines(CloudsReader(tmp_path / "a.h5"), {})[0].endswith(said)
 
 
 def test_the_closing_line_is_what_a_person_can_check(tmp_path):
