@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import stat
 from collections import Counter
 from concurrent.futures import Executor
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, is_dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError, reading
-from dpcli.path_names import as_utf8
+from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
@@ -30,6 +32,7 @@ from dpcli.store.heap_check import trust_heaps
 from dpcli.store.statistics import StatisticsReader
 from dpcli.store.writing.already_made import already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
+from dpcli.store.writing.journal import journal_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,11 +123,7 @@ def _fingerprint(path: Path) -> str:
     try:
         if not path.is_dir():
             return str(path.stat().st_size)
-        names = sorted(
-            name
-            for name in os.listdir(path)
-            if not name.startswith(".") and not name.lower().endswith((".h5", ".hdf5"))
-        )
+        names = sorted(name for name in os.listdir(path) if not _may_be_ours(name))
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
     except (
@@ -132,6 +131,34 @@ def _fingerprint(path: Path) -> str:
         ValueError,
     ):  # an item that is made, or of a file beside others, or not there, or whose name holds NUL
         return ""
+
+
+def _tell_newer(kept: Path, items: list[Item]) -> None:
+    """Warns of inputs that are newer than what an earlier run left: fingerprints hold sizes, and content may change without."""
+    if not kept.is_file():
+        return
+    made, date = kept.stat().st_mtime, cache(_date)  # items may share a folder
+    newer = [item.name for item in items if date(item.path) > made]
+    if newer:
+        log.warn(
+            f"newer than what an earlier run left ({kept.name}), and not read again where that had them: {first_names(newer)};"
+            " --force starts over"
+        )
+
+
+def _date(path: Path) -> float:
+    """Returns when a file, or the newest one of a folder, was written; 0 where there is none."""
+    with suppress(OSError, ValueError):
+        own = path.stat()
+        with os.scandir(path) if stat.S_ISDIR(own.st_mode) else nullcontext(()) as inside:
+            files = [one.stat().st_mtime for one in inside if one.is_file() and not _may_be_ours(one.name)]
+            return max(files, default=own.st_mtime)
+    return 0.0
+
+
+def _may_be_ours(name: str) -> bool:
+    """Returns whether a file in a folder of data may be the one that is being written."""
+    return name.startswith(".") or name.lower().endswith((".h5", ".hdf5"))
 
 
 def _roots(reader: Reader) -> list[Path]:
@@ -191,6 +218,8 @@ def convert(
     config = configuration(reader, conversion.thinning, items, conversion.compression)
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()
+    for kept in (output, journal_path(output)) if _roots(reader) and not conversion.force else ():
+        _tell_newer(kept, items)
     if not conversion.force and already_made(output, provenance, CloudsReader):
         report.was_complete = True
         return count_samples(report, output)

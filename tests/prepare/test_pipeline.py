@@ -321,6 +321,30 @@ def test_a_part_of_another_configuration_is_refused_and_force_starts_over(tmp_pa
     assert digest(path) == digest(tmp_path / "fresh.h5")
 
 
+@pytest.mark.parametrize("shape", ["file", "folder"])
+def test_inputs_that_are_newer_than_the_output_are_named(tmp_path, capsys, shape):
+    raw = tmp_path / "raw"
+    for name in "ab":
+        (raw / name).mkdir(parents=True)
+        for t in range(3):
+            depth = np.full((6, 8), 1000 + t, np.uint16)
+            np.save(raw / f"{name}.npy", np.stack([depth] * 3)) if shape == "file" else np.save(
+                raw / name / f"{t}.npy", depth
+            )
+    output = raw / "out.h5"
+    convert(DepthVideos(inputs=(raw,)), output)
+    assert convert(DepthVideos(inputs=(raw,)), output).was_complete and "newer than" not in capsys.readouterr().err
+    changed = raw / "a.npy" if shape == "file" else raw / "a" / "1.npy"
+    later = output.stat().st_mtime + 10
+    os.utime(changed, (later, later))
+    assert convert(DepthVideos(inputs=(raw,)), output).was_complete  # copying changes dates, too
+    told = capsys.readouterr().err
+    assert (
+        f"newer than what an earlier run left (out.h5), and not read again where that had them: {changed.relative_to(raw).parts[0]};"
+        in told
+    )
+
+
 def test_other_data_labels_or_classes_under_the_same_names_are_not_already_complete(tmp_path):
     from dpcli.prepare.scans.clouds import CloudFolders
 
