@@ -76,7 +76,8 @@ def evaluate_motion(
     intervals; without it there are none.
     """
     check_protocol(protocol)
-    counted = read_counted(path, "motion")
+    asked = {"protocol": protocol if protocol != "dpc" else None, "split": split}
+    counted = read_counted(path, "motion", asked, truth, keeping)
     if counted is None:
         with PairedSequences(
             path, named_truth(truth), split=split, intersect=intersect, fields=("part", "pose"), instead=("scene_flow",)

@@ -75,7 +75,8 @@ def evaluate_segmentation(
     the intervals; without it there are none.
     """
     check_protocol(protocol)
-    counted = read_counted(path, "segmentation")
+    asked = {"protocol": protocol if protocol != "dpc" else None, "ignore_below": ignore_below or None, "split": split}
+    counted = read_counted(path, "segmentation", asked, truth, keeping)
     if counted is None:
         with PairedSequences(path, named_truth(truth), split=split, intersect=intersect) as paired:
             about = {"task": "segmentation", "protocol": protocol, "ignore_below": ignore_below}

@@ -58,10 +58,18 @@ class Counted:
         return [LeftOut(reason, names) for reason, names in self.about["left_out"]]
 
 
-def read_counted(path: str | Path, task: str) -> Counted | None:
-    """Returns what a statistics file holds, None where `path` is another kind. Raises DataError where it is of another task."""
+def read_counted(
+    path: str | Path, task: str, asked: dict[str, Any], truth: str | Path | None, keeping: Keeping
+) -> Counted | None:
+    """Returns what a statistics file holds, None where `path` is another kind.
+
+    asked: the choices that the user named, None for those that weren't; truth: the file, if it was named. Raises DataError
+    where the file is of another task, UsageError where it was counted in another way than asked for.
+    """
     if file_kind(path) != "statistics":
         return None
+    if keeping.output is not None:
+        raise UsageError(f"-o {keeping.output}: {path} holds counts already; leave -o out, or name the parts file")
     reader = StatisticsReader(path)
     about = reader.provenance[-1].get("config", {})
     if about.get("task") != task or "shard" in about:
@@ -69,6 +77,12 @@ def read_counted(path: str | Path, task: str) -> Counted | None:
             f"shard {about['shard']} of an evaluation" if "shard" in about else f"an evaluation of {about.get('task')}"
         )
         raise DataError(f"{path}: holds {what}, expected the whole of one of {task}; dpc prepare merge joins shards")
+    kept = {**about, "truth": Path(about["truth"]).name}
+    for key, value in {**asked, "truth": truth and Path(truth).name}.items():
+        if value is not None and value != kept.get(key):
+            raise UsageError(
+                f"--{key.replace('_', '-')} {value}: {path} was counted with {kept.get(key)!r}; name the parts file to count again"
+            )
     return _counted(reader)
 
 
