@@ -51,6 +51,8 @@ def export_scene(
         raise UsageError(f"--time is of one file: name it with --as {kind} -o FILE.{kind}")
     if points is not None and form != "clouds":
         raise UsageError(f"--points is of --as clouds; leave it out for {form}")
+    if min_opacity is not None and form in _TABLES:
+        raise UsageError(f"--min-opacity is of Gaussians and clouds; leave it out for {form}")
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
         config = {"as": form, "axes": axes, "min_opacity": min_opacity, "points": points}

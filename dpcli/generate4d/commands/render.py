@@ -93,6 +93,10 @@ def _render_path(renderer: Renderer, look: Look, output: Path, settings: RenderS
     kind, path = output_kind(output), settings.path
     if look.background is None and kind in (".mp4", ".gif"):
         raise UsageError(f"-o {output}: {kind} has no transparency; use a .png or a folder, or another --background")
+    if kind == ".png" and (unused := settings.changed("frames", "fps")):
+        raise UsageError(
+            f"{', '.join(unused)}: -o {output} is one picture; name a .mp4, a .gif or a folder, or leave it out"
+        )
     times = {"frames": settings.frames, "fps": settings.fps, "time": settings.time}
     shots = plan_shots(renderer.scene, path, _lens(settings), **times)
     shots = shots[:1] if kind == ".png" else shots

@@ -177,6 +177,8 @@ class DepthVideos:
                     " that holds both"
                 )
             items[name] = Item(name, path, extra={"series": series, "recording": is_recording(path)})
+        if self.topic and not any(item.extra["recording"] for item in items.values()):
+            raise UsageError(f"--topic {self.topic}: no recording (.bag, .mcap, .db3) among the inputs; leave it out")
         return list(items.values())
 
     def items(self) -> list[Item]:

@@ -264,6 +264,9 @@ def test_single_files_and_an_instant(scene_file, tmp_path):
         with pytest.raises(DataError, match=rf"holds 0 to [\d.]+ s, but --time is {time:g}"):
             export_scene(str(scene_file), str(tmp_path / "b.ply"), time=time, **usual)
     assert not (tmp_path / "b.ply").exists()
+    usual |= {"form": "cameras", "min_opacity": 0.5}
+    with pytest.raises(UsageError, match="--min-opacity is of Gaussians and clouds"):
+        export_scene(str(scene_file), str(tmp_path / "c.json"), time=None, **usual)
 
 
 def test_an_export_flows_into_the_segmenter(dpc, dpc_here, scene_file, tmp_path):

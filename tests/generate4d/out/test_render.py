@@ -225,6 +225,8 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
     late = [*words[:1], "--set", "frames=2", "--time", "99", "-o", str(tmp_path / "q.gif")]
     assert "but --time is 99" in str(CliRunner().invoke(app, late).exception)
+    many = [*words[:1], "--set", "frames=2", "-o", str(tmp_path / "q.png")]
+    assert "frames: -o" in str(CliRunner().invoke(app, many).exception)
     render_views(renderer, replace(header, time=np.array([0.0, 9.0])), tmp_path / "late.h5")
     late = [*words[:3], "--cameras", str(tmp_path / "late.h5"), "-o", str(tmp_path / "q.h5")]
     assert "late.h5 has frames from 0 to 9 s; was it" in str(CliRunner().invoke(app, late).exception)

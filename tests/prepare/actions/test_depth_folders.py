@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.depth import DepthVideos
 
 RNG = np.random.default_rng(0)
@@ -247,6 +247,12 @@ def test_a_take_that_a_letter_counts_is_no_folder_of_depth(tmp_path, names):
         write(tmp_path / "push" / name, **{f"{t:03}": depth(1000 + t) for t in range(3)})
     reader = DepthVideos(inputs=(tmp_path,))
     assert [item.name for item in reader.items()] == [f"push/{name}" for name in sorted(names)]
+
+
+def test_a_topic_without_a_recording_is_refused(tmp_path):
+    write(tmp_path / "a", **{"000": depth(1000), "001": depth(1001)})
+    with pytest.raises(UsageError, match="--topic /depth: no recording"):
+        DepthVideos(inputs=(tmp_path,), topic="/depth").items()
 
 
 def test_what_is_not_read_beside_the_videos_is_counted(tmp_path):
