@@ -141,10 +141,9 @@ def test_a_urdf_is_in_meters_whatever_the_clouds_are_in(few, tmp_path, dpc_here)
         name, file.attrs["length_unit"] = file["name"][0].decode(), "mm"
         file["points"][:] = 1000 * file["points"][:]
         file["part_motion"][..., :3, 3] = 1000 * file["part_motion"][..., :3, 3]
-    for parts, output in ((few, "m"), (tmp_path / "mm.h5", "mm")):
-        for suffix in (".urdf", ".json"):
-            done = dpc_here("segment", "joints", parts, "-o", tmp_path / f"{output}{suffix}", "--sequence", name)
-            assert done.returncode == 0, done.stderr
+    for parts, output in ((few, "m.urdf"), (tmp_path / "mm.h5", "mm.urdf"), (tmp_path / "mm.h5", "mm.json")):
+        done = dpc_here("segment", "joints", parts, "-o", tmp_path / output, "--sequence", name)
+        assert done.returncode == 0, done.stderr
     one, other = (ElementTree.parse(tmp_path / f"{unit}.urdf").getroot() for unit in ("m", "mm"))
     for path, key in (("joint/origin", "xyz"), ("joint/limit", "upper")):
         found = [[list(map(float, item.get(key).split())) for item in robot.iterfind(path)] for robot in (one, other)]
