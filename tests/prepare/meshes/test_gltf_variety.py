@@ -169,6 +169,22 @@ def test_a_leaf_of_two_triangles_back_to_back_has_no_holes(tmp_path):
     assert (look(load(file, tmp_path))[..., 3] == 255).all()
 
 
+@pytest.mark.parametrize("path, values", [("scale", np.repeat([[0.0], [1], [1]], 3, 1)), ("visible", [0, 1, 1])])
+def test_what_is_hidden_at_first_shows_no_back_either(tmp_path, path, values):
+    file = empty()
+    node(file, mesh=0, rotation=[0, 1, 0, 0])
+    file.animate(0, path, [0, 0.5, 1], values, "STEP")
+    if path == "visible":
+        pointer = {"pointer": "/nodes/0/extensions/KHR_node_visibility/visible"}
+        target = {"path": "pointer", "extensions": {"KHR_animation_pointer": pointer}}
+        file.tree["animations"][0]["channels"][0]["target"] = target
+    mesh = load(file, tmp_path, frames=4)
+    assert [look(mesh, frame=frame)[32, 32, 3] for frame in range(4)] == [0] * 4
+    file.tree["nodes"][0]["rotation"] = [0, 0, 0, 1]
+    mesh = load(file, tmp_path, frames=4)
+    assert [look(mesh, frame=frame)[32, 32, 3] for frame in range(4)] == [0, 0, 255, 255]
+
+
 # instances
 
 
