@@ -11,7 +11,7 @@ from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 # unit, where the light comes from: above, in front, a little to the right
 _LIGHT = np.array([0.37, 0.74, 0.56], np.float32)
 _DECODED = to_linear(np.arange(256) / 255).astype(np.float32)
-_LAYERS = 16  # most surfaces that one ray passes through
+_LAYERS = 1024  # most surfaces that one ray passes through: shells of fur and leaves are dozens
 _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface
 
 

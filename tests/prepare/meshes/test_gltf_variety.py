@@ -185,6 +185,17 @@ def test_what_is_hidden_at_first_shows_no_back_either(tmp_path, path, values):
     assert [look(mesh, frame=frame)[32, 32, 3] for frame in range(4)] == [0, 0, 255, 255]
 
 
+def test_dozens_of_clear_layers_hide_nothing_behind_them(tmp_path):
+    """As shells of fur and the leaves of a tree, cut out of cards."""
+    file = quad()
+    file.tree["materials"] = [{"alphaMode": "MASK", "doubleSided": True}]
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = file.add(np.tile([1, 1, 1, 0.1], (4, 1)))
+    for layer in range(40):
+        node(file, mesh=0, translation=[0, 0, 0.01 * layer])
+    node(file, mesh=square(file, 0.0, z=-0.5))
+    assert look(load(file, tmp_path))[32, 32].tolist() == [0, 0, 255, 255]
+
+
 # instances
 
 
