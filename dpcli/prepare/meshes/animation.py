@@ -13,7 +13,7 @@ from dpcli.prepare.meshes.gltf import Gltf, read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
 from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
-from dpcli.prepare.views.views_pipeline import Clip
+from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import file_digest
 
@@ -89,4 +89,6 @@ def animation_config(path: Path, clip: str | None, frames: int, filming: Filming
     """Returns what decides the content, for the file's provenance."""
     with well_formed(path):
         name = clip_names(file := read_gltf(path))[choose_clip(file, clip)]
-    return {"input": path.name, "digest": file_digest(path)[:16], "clip": name, "frames": frames, **filming.config}
+        beside = file.files_beside()
+    digests = {"digest": file_digest(path)[:16], **({"beside_digest": digest_of(beside)} if beside else {})}
+    return {"input": path.name, **digests, "clip": name, "frames": frames, **filming.config}

@@ -13,7 +13,7 @@ import io
 import re
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from posixpath import normpath
@@ -199,6 +199,15 @@ class Gltf:
         uri = re.sub(r"[\t\n\r]", "", uri.strip())
         if uri[:5].lower() == "data:":
             return self._embedded(uri)
+        try:
+            return self._place(uri).read_bytes()
+        except OSError as error:
+            raise self.fail(
+                f"its file {uri[:80]!r} cannot be read ({error.strerror}); keep it beside the .gltf"
+            ) from None
+
+    def _place(self, uri: str) -> Path:
+        """Returns where the file of a URI lies. Raises DataError unless that is below the root."""
         folder = self.path.parent
         if _SCHEME.match(uri):
             raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it")
@@ -207,13 +216,16 @@ class Gltf:
             places = [path_inside(self.root, folder, normpath(name.replace("\\", "/"))) for name in names]
         except DataError:
             raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it") from None
-        target = next((place for place in places if place.is_file()), places[0])
-        try:
-            return target.read_bytes()
-        except OSError as error:
-            raise self.fail(
-                f"its file {uri[:80]!r} cannot be read ({error.strerror}); keep it beside the .gltf"
-            ) from None
+        return next((place for place in places if place.is_file()), places[0])
+
+    def files_beside(self) -> list[Path]:
+        """Returns the files of buffers and textures that it names, without those outside of the root, which are never read."""
+        uris = [str(entry["uri"]) for kind in ("buffers", "images") for entry in self.items(kind) if "uri" in entry]
+        found = []
+        for uri in uris:
+            with suppress(DataError):  # a data: URI is one of them
+                found.append(self._place(re.sub(r"[\t\n\r]", "", uri.strip())))
+        return found
 
     def _embedded(self, uri: str) -> bytes:
         head, _, body = uri.partition(",")

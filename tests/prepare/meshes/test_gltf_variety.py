@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.meshes.animated_mesh import normalized
-from dpcli.prepare.meshes.animation import clip_outputs, list_clips, load_animation
+from dpcli.prepare.meshes.animation import animation_config, clip_outputs, list_clips, load_animation
 from dpcli.prepare.meshes.filming import Filming, film, ground_truth
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.skinning import Curve
@@ -648,6 +648,23 @@ def test_names_that_lead_outside_are_refused(tmp_path, uri):
     (folder / "link.bin").symlink_to(tmp_path / "s.bin")
     with pytest.raises(DataError, match="outside its folder"):
         load_animation(split(quad(), folder, "", uri.format(tmp_path / "s.bin")), None, 1)
+
+
+@pytest.mark.parametrize(
+    "kind, name", [("buffers", "a.bin"), ("images", "b.png"), ("images", "data:,x"), ("images", "../s")]
+)
+def test_other_files_beside_a_model_are_another_clip(tmp_path, kind, name):
+    """So that a finished file is not taken for what a model with a new texture makes."""
+    path = split(quad(), tmp_path, "a.bin", "a.bin")
+    tree = json.loads(path.read_text())
+    path.write_text(json.dumps({**tree, "images": [{"uri": name}]}))
+    before = animation_config(path, None, 2, SMALL)
+    with open(tmp_path / ("a.bin" if kind == "buffers" else "b.png"), "ab") as file:
+        file.write(b"new")
+    assert (animation_config(path, None, 2, SMALL) == before) == (name not in ("a.bin", "b.png"))
+    assert animation_config(quad().write(tmp_path / "m.glb"), None, 2, SMALL).keys() == before.keys() - {
+        "beside_digest"
+    }
 
 
 @settings(max_examples=25, derandomize=True, deadline=None)
