@@ -14,8 +14,8 @@ from dpcli.errors import DataError
 from dpcli.generate4d.out.splat_files import Splats
 from dpcli.runtime.whole_file import write_whole
 
-_FINE_BITS, _COARSE_BITS = 16, 12  # of 24 a coordinate, behind the point: steps of 1/65536, or of 1/4096
-_FINE_REACH = 120.0  # units up to which the fine ones do, which end at 128
+_BITS = (16, 12, 8, 4)  # of 24 a coordinate, behind the point: steps of 1/65536, of 1/4096 ...
+_REACH = 120.0  # units up to which the finest do, which end at 128; each other ones 16 times as far
 
 
 def write_compressed_ply(path: Path, splats: Splats) -> None:
@@ -34,7 +34,10 @@ def write_spz(path: Path, splats: Splats) -> None:
     is not installed.
     """
     gsply = _gsply(path)
-    bits = _FINE_BITS if np.abs(splats.mean).max() < _FINE_REACH else _COARSE_BITS
+    farthest = float(np.abs(splats.mean).max())
+    bits = next((bits for bits in _BITS if farthest < _REACH * 2 ** (_BITS[0] - bits)), None)
+    if bits is None:
+        raise DataError(f"{path}: .spz holds no coordinate of {farthest:g}; write --as compressed.ply or ply")
     packed = _written(lambda place: gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits), ".spz")
     write_whole(path, gzip.compress(gzip.decompress(packed), mtime=0))  # equal scenes give equal bytes
 

@@ -138,10 +138,13 @@ def test_a_compressed_ply_holds_the_gaussians(scene, tmp_path):
     np.testing.assert_allclose(_without_sign(read["quaternion"]), _without_sign(splats.quaternion), atol=3e-3)
 
 
-def test_far_coordinates_are_not_wrapped(scene, tmp_path):
-    far = replace(Splats.of(scene), mean=Splats.of(scene).mean + np.float32([500, 0, 0]))
+@pytest.mark.parametrize("place", [500, -3e3, 1e5, 4e5])
+def test_far_coordinates_are_not_wrapped(scene, tmp_path, place):
+    far = replace(Splats.of(scene), mean=Splats.of(scene).mean + np.float32([place, 0, 0]))
     write_spz(tmp_path / "a.spz", far)
-    np.testing.assert_allclose(_read_spz(tmp_path / "a.spz")["mean"], far.mean, atol=1 / 4096)
+    np.testing.assert_allclose(_read_spz(tmp_path / "a.spz")["mean"], far.mean, atol=max(1 / 4096, abs(place) / 1e5))
+    with pytest.raises(DataError, match=r"b.spz: .spz holds no coordinate of 1e\+07; write --as"):
+        write_spz(tmp_path / "b.spz", replace(far, mean=np.full_like(far.mean, 1e7)))
 
 
 @pytest.mark.parametrize(("write", "suffix"), [(write_spz, "spz"), (write_compressed_ply, "compressed.ply")])
