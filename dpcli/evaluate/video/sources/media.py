@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,12 +46,12 @@ class FolderSource(Source):
         self.views = [_view_of_folder("" if folder == path else folder.name) for folder in folders]
         self.frames = [len(files) for files in self.files]
         self.numbers = [_counted(files) for files in self.files]
-        self.has_alpha = _read_image(self.files[0][0])[1]
+        self.has_alpha = any(_has_alpha(file) for files in self.files for file in files)
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
         """Yields the frames of a view, in rising order."""
         for frame in frames:
-            yield Picture(rgba=_read_image(self.files[view][frame])[0])
+            yield Picture(rgba=_read_image(self.files[view][frame]))
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -81,15 +83,25 @@ def _view_of_folder(name: str) -> View:
     return View((name, *([str(int(number[1]))] if number and str(int(number[1])) != name else ())), "test")
 
 
-def _read_image(path: Path) -> tuple[np.ndarray, bool]:
-    """Returns rgba u8 (H,W,4), and whether the file has alpha. Raises DataError if unreadable or not 8-bit color."""
+def _has_alpha(path: Path) -> bool:
+    with _opened(path) as image:
+        return not {"A", "a"}.isdisjoint(image.getbands()) or "transparency" in image.info
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """Returns rgba u8 (H,W,4). Raises DataError if unreadable or not 8-bit color."""
+    with _opened(path) as image:
+        return np.asarray(as_shown(image).convert("RGBA"))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     try:
         with open_image(path) as image:
             require_one_picture(path, image)
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
-            has_alpha = not {"A", "a"}.isdisjoint(image.getbands()) or "transparency" in image.info
-            return np.asarray(as_shown(image).convert("RGBA")), has_alpha
+            yield image
     except DataError:
         raise
     except Exception as error:  # a damaged image raises nearly anything, and one of a vast size DecompressionBombError

@@ -125,6 +125,18 @@ def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list,
             evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",))
 
 
+@pytest.mark.parametrize("cut_out", [(), (0,), (1,), (0, 1, 2)])
+def test_a_folder_has_alpha_where_any_of_its_pictures_has(tmp_path: Path, cut_out: tuple) -> None:
+    for frame in range(3):
+        picture = Image.new("RGBA" if frame in cut_out else "RGB", (16, 16), (80, 0, 0))
+        if frame in cut_out:
+            picture.putalpha(0)
+            picture.paste((80, 0, 0, 255), (0, 0, 8, 16))
+        picture.save(tmp_path / f"{frame}.png")
+    report = evaluate_video(tmp_path, tmp_path)
+    assert ("silhouette_iou" in report.names) == bool(cut_out) and (not report.notes) == bool(cut_out)
+
+
 @pytest.mark.parametrize("digits", [1, 2, 5])
 def test_views_of_any_number_of_digits_are_the_same(tmp_path: Path, digits: int) -> None:
     for view in range(11):
