@@ -127,11 +127,15 @@ class FramePass:
         return min(own, other)
 
     def _numbered_otherwise(self, ours: int, theirs: int) -> str:
-        """Returns, in words, the first frames that the names of both sides number in different steps; "" without such."""
+        """Returns, in words, the first frames that the names of both sides number in different steps; "" without such.
+
+        Of sides that have not equally many, the names count themselves: the first frame may be what one lacks.
+        """
         own, other = (s.numbers[i] if s.numbers else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
         if own is None or other is None:
             return ""
-        odd = [k for k in range(1, min(len(own), len(other))) if own[k] - own[k - 1] != other[k] - other[k - 1]]
+        first = (own[0], other[0]) if len(own) == len(other) else (0, 0)
+        odd = [k for k, (a, b) in enumerate(zip(own, other)) if a - first[0] != b - first[1]]
         return f"{own[odd[0]]} with {other[odd[0]]}" if odd else ""
 
     def _frame_jobs(
