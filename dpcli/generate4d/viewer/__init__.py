@@ -90,7 +90,7 @@ def _differences(values: np.ndarray) -> np.ndarray:
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
     """Returns quaternions (T,N,4) with signs such that no Gaussian jumps from q to -q between frames."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
-    return quaternions * np.concatenate([np.ones_like(flips[:1]), np.cumprod(flips, 0)])
+    return quaternions * np.concatenate([np.ones_like(quaternions[:1, :, :1]), np.cumprod(flips, 0)])
 
 
 def describe(

@@ -167,6 +167,13 @@ def test_what_is_packed_is_the_scene_up_to_rounding(scene, page):
     np.testing.assert_array_equal(part.astype(int) - 1, scene.part)
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_still_scene_keeps_how_its_gaussians_are_turned(frames):
+    arrays = packed(scene := toy_scene(per_part=20, frames=frames))
+    turns = np.cumsum(arrays["turn"], axis=0, dtype=np.uint8).view(np.int8).transpose(0, 2, 1) / 127
+    np.testing.assert_allclose(turns, scene.frame_quaternion, atol=0.5 / 127 + 1e-6)
+
+
 def test_the_page_stays_small():
     """Noise, which nothing compresses: 16 bits a coordinate, a byte a quaternion's number, of 4 for 3 in base64."""
     rng = np.random.default_rng(0)
