@@ -65,7 +65,7 @@ def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
 def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     """Packs what the page reads, in its order. Moving things are differences to the frame before, which compress better;
     bytes of 16-bit numbers lie apart, low bytes first: position u8 (2,T,3,N), turn u8 (T,4,N), weight u8 (T,N), scale
-    f32 (3,N), color u8 (4,N) with opacity, part u8 (N) = id + 1."""
+    f32 (3,N), color u8 (4,N) with opacity, part u8 (2,N) = id + 1."""
     low, extent = _box(scene)
     steps = np.rint((scene.frame_mean - low) / extent * _POSITIONS).astype(np.uint16).transpose(0, 2, 1)
     change = _differences(steps)
@@ -73,13 +73,18 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     weight = np.rint(np.clip(scene.rigid_weight, 0, 1) * _BYTE).astype(np.uint8)
     rgba = np.concatenate([scene.color.T, np.rint(scene.opacity * _BYTE).astype(np.uint8)[None]])
     return {
-        "position": np.stack([(change & 255).astype(np.uint8), (change >> 8).astype(np.uint8)]),
+        "position": _bytes_apart(change),
         "turn": _differences(turns),
         "weight": _differences(weight),
         "scale": scene.scale.T.astype("<f4"),
         "color": rgba,
-        "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
+        "part": _bytes_apart((scene.part + 1).astype(np.uint16)),
     }
+
+
+def _bytes_apart(values: np.ndarray) -> np.ndarray:
+    """Returns u8 (2,...): the low bytes of u16 numbers, then the high ones."""
+    return np.stack([(values & 255).astype(np.uint8), (values >> 8).astype(np.uint8)])
 
 
 def _differences(values: np.ndarray) -> np.ndarray:

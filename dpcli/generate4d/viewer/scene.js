@@ -13,7 +13,8 @@ class Scene {
     this.weight = summed(cut("weight", frames * count), count);
     this.scale = new Float32Array(cut("scale", 12 * count).buffer);
     this.color = cut("color", 4 * count);
-    this.part = cut("part", count);
+    const part = cut("part", 2 * count);
+    this.part = Uint16Array.from({ length: count }, (_, i) => part[i] | (part[count + i] << 8));
     this.mean = new Float32Array(3 * count);
     this.covariance = new Float32Array(6 * count);
     this.order = new Uint32Array(count);

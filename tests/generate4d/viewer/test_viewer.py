@@ -163,8 +163,18 @@ def test_what_is_packed_is_the_scene_up_to_rounding(scene, page):
     data = zlib.decompress(base64.b64decode(re.search(r'id="data">(.*?)</script>', text, re.S)[1]))
     header = json.loads(re.search(r'id="header">(.*?)</script>', text, re.S)[1])
     assert len(data) == header["bytes"] == sum(values.nbytes for values in arrays.values())
-    part = np.frombuffer(data, np.uint8)[header["starts"]["part"] :]
-    np.testing.assert_array_equal(part.astype(int) - 1, scene.part)
+    np.testing.assert_array_equal(_parts(np.frombuffer(data, np.uint8)[header["starts"]["part"] :]), scene.part)
+
+
+def _parts(data: np.ndarray) -> np.ndarray:
+    low, high = data.reshape(2, -1).astype(int)
+    return low + 256 * high - 1
+
+
+def test_hundreds_of_parts_are_told_apart():
+    scene = toy_scene(per_part=400)
+    many = replace(scene, part=np.arange(-1, scene.num_gaussians - 1, dtype=np.int16))
+    np.testing.assert_array_equal(_parts(packed(many)["part"]), many.part)
 
 
 @pytest.mark.parametrize("frames", [1, 2])
