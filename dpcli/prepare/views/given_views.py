@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
 _TURN = 6.29  # a whole turn in radians
+_OF_VIEW = re.compile("view|cam|eval", re.IGNORECASE)  # how the name of a view's folder begins
 _KEYS = {"azimuth", "elevation", "radius", "fovy", "role"}
 _EXAMPLE = '[{"azimuth": 30, "elevation": 20}, ...] in degrees (also radius, fovy, role: train or test)'
 
@@ -89,10 +91,19 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
     table = [image_paths(one) for one in inner]
     views = len(cameras) if cameras else 6
     per_folder = sorted({len(row) for row in table})
-    if per_folder == [views] and len(inner) >= len(numbers):
+    by_frame = per_folder == [views] and len(inner) >= len(numbers)
+    by_view = len(inner) == views and per_folder[0] >= len(numbers)
+    if by_frame and by_view:
+        by_frame = not all(_OF_VIEW.match(one.name) for one in inner)
+        if by_frame and not any("rgba" in one.name or "frame" in one.name.lower() for one in inner):
+            log.warn(
+                f"{folder}: {views} folders of {views} pictures are taken for FRAME/VIEW.png; where each holds a view, name "
+                "them view0, view1 ..."
+            )
+    if by_frame:
         rows = _matching(folder, frame_numbers([one.name for one in inner]), numbers, total)
         return [[table[row][view] for row in rows] for view in range(views)]
-    if len(inner) == views and per_folder[0] >= len(numbers):
+    if by_view:
         stems = [[path.stem for path in row] for row in table]
         return [
             [row[at] for at in _matching(one, frame_numbers(names), numbers, total)]

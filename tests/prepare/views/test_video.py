@@ -499,6 +499,21 @@ def test_views_belong_to_the_frames_that_are_used(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("names", "of_view", "told"),
+    [("view{}", True, False), ("Cam_{}", True, False), ("{}_rgba", False, False), ("{}", False, True)],
+)
+def test_as_many_frames_as_views_are_told_apart_by_the_names_of_folders(tmp_path, capfd, names, of_view, told):
+    folder = save(tmp_path / "ref", moving(6))
+    for outer in range(6):
+        own = [disc((16 + outer, 16 + inner), 7, (32, 32)) for inner in range(6)]
+        save(tmp_path / "views" / names.format(outer), own)
+    found = read(video_clip(folder, VideoOptions(size=32, views=tmp_path / "views")))
+    x, y = (1, 4) if of_view else (4, 1)
+    np.testing.assert_allclose(centroid(found[1 + 1, 4]), (16 + x, 16 + y), atol=0.05)
+    assert ("6 folders of 6 pictures are taken for FRAME/VIEW.png" in capfd.readouterr().err) == told
+
+
+@pytest.mark.parametrize(
     ("cameras", "message"),
     [
         ("{}", "list of cameras"),
