@@ -97,6 +97,13 @@ class ViewsHeader:
                 raise DataError(
                     f"{self.name!r}: intrinsics of view {view} are not [[fx s cx] [0 fy cy] [0 0 1]], fx, fy > 0"
                 )
+            if (
+                abs(camera[0, 1]) * self.size[1] > camera[1, 1]
+            ):  # shifts the ends of the picture by more than half a pixel
+                raise DataError(
+                    f"{self.name!r}: intrinsics of view {view} have a skew of {camera[0, 1]:g}; expected pixels that are "
+                    "rectangles, since nothing draws others"
+                )
             rotation = pose[:3, :3]
             off = np.abs(rotation @ rotation.T - np.eye(3)).max()
             if off > _RIGID or np.linalg.det(rotation) < 0 or list(pose[3]) != [0, 0, 0, 1]:

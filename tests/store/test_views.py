@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from contextlib import nullcontext
 from dataclasses import replace
 
 import h5py
@@ -146,6 +147,14 @@ def test_a_broken_header_is_refused_before_writing(tmp_path, field):
     with pytest.raises(DataError, match=message):
         ViewsWriter(tmp_path / "a.h5", replace(header, **{field: change(header)}))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("skew", "refused"), [(0.0, False), (0.5, False), (2.0, True), (-2.0, True)])
+def test_a_skew_that_no_picture_would_show_is_refused(skew, refused):
+    header = make_header()
+    header.intrinsics[1, 0, 1] = skew
+    with pytest.raises(DataError, match="view 1 have a skew of -?2; expected pixels") if refused else nullcontext():
+        header.validate()
 
 
 @pytest.mark.parametrize(
