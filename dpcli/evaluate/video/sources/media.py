@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -77,6 +78,7 @@ def _view_of_folder(name: str) -> View:
 
     `2`, `view_2`, `cam-02`: view 2 of a views file; `reference`, `ref`, `input`, or one folder alone: the reference.
     """
+    name = normalize("NFC", name)  # macOS takes letters and their accents apart
     if name.lower() in ("", "reference", "ref", "input"):
         return View(tuple(dict.fromkeys([name.lower() or "reference", "reference"])), "reference")
     number = re.fullmatch(r"(?:view|cam|camera)?[-_]?(\d+)", name.lower())

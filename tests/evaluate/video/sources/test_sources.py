@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,14 @@ def test_views_of_any_number_of_digits_are_the_same(tmp_path: Path, digits: int)
         write_folder(tmp_path / "a" / f"{view:0{digits}}", clip(1, views=1)[0])
         write_folder(tmp_path / "b" / f"cam{view}", clip(1, views=1)[0])
     assert len(evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",)).views) == 11
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_views_are_the_same_whatever_system_spelled_their_names(tmp_path: Path, form: str) -> None:
+    for folder, spelled in (("a", form), ("b", "NFC")):
+        for name in ("Ä", "é", "c"):
+            write_folder(tmp_path / folder / unicodedata.normalize(spelled, name), clip(1, views=1)[0])
+    assert len(evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",)).views) == 3
 
 
 def test_floats_about_zero_are_refused(tmp_path: Path) -> None:
