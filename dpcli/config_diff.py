@@ -8,6 +8,7 @@ import re
 _DIGEST = re.compile('"(?:[0-9a-f]{16}|[0-9a-f]{64})"')
 _LONG = 80  # letters of a value that nobody compares by eye
 _NOUNS = {
+    "digest": "input file",
     "input": "input files",
     "items": "samples, labels or sizes of files",
     "mask": "masks",

@@ -90,5 +90,5 @@ def animation_config(path: Path, clip: str | None, frames: int, filming: Filming
     with well_formed(path):
         name = clip_names(file := read_gltf(path))[choose_clip(file, clip)]
         beside = file.files_beside()
-    digests = {"digest": file_digest(path)[:16], **({"beside_digest": digest_of(beside)} if beside else {})}
+    digests = {"digest": file_digest(path)[:16], **({"files_beside_digest": digest_of(beside)} if beside else {})}
     return {"input": path.name, **digests, "clip": name, "frames": frames, **filming.config}

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dpcli.config_diff import differences
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.meshes.animated_mesh import normalized
 from dpcli.prepare.meshes.animation import animation_config, clip_outputs, list_clips, load_animation
@@ -662,8 +663,10 @@ def test_other_files_beside_a_model_are_another_clip(tmp_path, kind, name):
     with open(tmp_path / ("a.bin" if kind == "buffers" else "b.png"), "ab") as file:
         file.write(b"new")
     assert (animation_config(path, None, 2, SMALL) == before) == (name not in ("a.bin", "b.png"))
+    if name == "a.bin":
+        assert differences(before, animation_config(path, None, 2, SMALL)) == ["other files beside"]
     assert animation_config(quad().write(tmp_path / "m.glb"), None, 2, SMALL).keys() == before.keys() - {
-        "beside_digest"
+        "files_beside_digest"
     }
 
 
