@@ -12,7 +12,15 @@ from dpcli.prepare.meshes.animated_mesh import SHRUNK, AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.gltf_extensions import decompress, instances
 from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
-from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, node_visibility, read_clip
+from dpcli.prepare.meshes.gltf_nodes import (
+    Clip,
+    node_name,
+    node_parents,
+    node_poses,
+    node_visibility,
+    read_clip,
+    require_affine,
+)
 from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.runtime.progress import log
 
@@ -232,7 +240,9 @@ def _read_skin(file: Gltf, index: int) -> tuple[np.ndarray, np.ndarray]:
     found = file.accessor(entry["inverseBindMatrices"], f"bones of skin {index}", 16).reshape(-1, 4, 4)
     if len(found) < len(joints):
         raise file.fail(f"skin {index} has {len(found)} bind matrices for {len(joints)} bones; export the file again")
-    return joints, found[: len(joints)].transpose(0, 2, 1).astype(np.float64)
+    inverse = found[: len(joints)].transpose(0, 2, 1).astype(np.float64)
+    require_affine(file, inverse, f"a bind matrix of skin {index}")
+    return joints, inverse
 
 
 def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) -> _Piece:

@@ -14,6 +14,7 @@ from dpcli.prepare.meshes.skinning import Curve, matrices
 from dpcli.runtime.progress import log
 
 _REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+_AFFINE = 1e-3  # what 32 bits and careless exporters leave of 0, 0, 0, 1
 _POINTER = re.compile(
     r"/nodes/(\d+)/(?:extensions/KHR_node_visibility/(?=visible$))?(visible|translation|rotation|scale|weights)"
 )
@@ -198,12 +199,23 @@ def _local(file: Gltf, index: int, clip: Clip, time: np.ndarray) -> np.ndarray:
             raise file.fail(
                 f"node {node_name(file, index)!r} is animated but stored as a matrix; export the file again"
             )
-        return np.tile(_numbers(file, index, "matrix", 16).reshape(4, 4).T, (len(time), 1, 1))
+        matrix = _numbers(file, index, "matrix", 16).reshape(4, 4).T
+        require_affine(file, matrix, f"matrix of node {node_name(file, index)!r}")
+        return np.tile(matrix, (len(time), 1, 1))
     values = {}
     for path, rest in _REST.items():
         fixed = _numbers(file, index, path, len(rest)) if path in node else np.array(rest)
         values[path] = clip.curves[index, path].at(time) if path in moving else np.tile(fixed, (len(time), 1))
     return matrices(values["translation"], values["rotation"], values["scale"])
+
+
+def require_affine(file: Gltf, matrices: np.ndarray, what: str) -> None:
+    """Raises DataError unless (...,4,4) end in rows 0 0 0 1: whoever writes them row by row loses every shift."""
+    rows = matrices.reshape(-1, 4, 4)[:, 3]
+    wrong = np.abs(rows - (0, 0, 0, 1)).max(1) > _AFFINE
+    if wrong.any():
+        row = ", ".join(f"{value:g}" for value in rows[wrong][0])
+        raise file.fail(f"{what} has the last row {row}; expected 0, 0, 0, 1 (is it transposed?)")
 
 
 def _numbers(file: Gltf, index: int, key: str, count: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import json
 import re
 import struct
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -195,6 +196,20 @@ def test_dozens_of_clear_layers_hide_nothing_behind_them(tmp_path):
         node(file, mesh=0, translation=[0, 0, 0.01 * layer])
     node(file, mesh=square(file, 0.0, z=-0.5))
     assert look(load(file, tmp_path))[32, 32].tolist() == [0, 0, 255, 255]
+
+
+@pytest.mark.parametrize("what", ["matrix of node 'rig'", "a bind matrix of skin 0"])
+@pytest.mark.parametrize("transposed", [True, False])
+def test_matrices_written_row_by_row_are_refused(tmp_path, what, transposed):
+    file, shift = arm(), np.eye(4)
+    shift[:3, 3] = [-1, 0, 0]
+    columns = shift.ravel() if transposed else shift.T.ravel()
+    if what.startswith("matrix"):
+        file.tree["nodes"][0] = {"name": "rig", "children": [1, 3], "matrix": columns.tolist()}
+    else:
+        file.tree["skins"][0]["inverseBindMatrices"] = file.add([columns, columns])
+    with pytest.raises(DataError, match=f"{what} has the last row -1, 0, 0, 1; ") if transposed else nullcontext():
+        load(file, tmp_path)
 
 
 # instances
