@@ -358,6 +358,8 @@ def _binding(
 ) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
     """Returns bones (nodes) i64 (V,J), weights f32 (V,J) that sum to 1, inverse bind matrix of every bone used."""
     count = len(positions)
+    if skins is not None and "JOINTS_0" not in attributes:
+        log.warn(f"{file.path}: {where} has a skin but no JOINTS_0; it moves with its node")
     if skins is None or "JOINTS_0" not in attributes:
         return np.full((count, 1), node), np.ones((count, 1), np.float32), {node: np.eye(4)}
     joints, inverse = skins

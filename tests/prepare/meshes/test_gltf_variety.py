@@ -495,6 +495,13 @@ def test_what_is_left_out_is_named(tmp_path, capsys, change, words):
     assert words in capsys.readouterr().err
 
 
+def test_a_skin_that_carries_nothing_is_named(tmp_path, capsys):
+    file = arm()
+    del file.tree["meshes"][0]["primitives"][0]["attributes"]["JOINTS_0"]
+    load(file, tmp_path)
+    assert "mesh of 'strip' has a skin but no JOINTS_0; it moves with its node" in capsys.readouterr().err
+
+
 def test_what_two_of_the_file_say_of_one_thing_is_told(tmp_path, capsys):
     file = arm()
     file.tree["skins"][0]["joints"] = [1, 1]
