@@ -157,7 +157,7 @@ _EMBEDDING = (
 )
 _VIEWS = (
     Field("rgba", "u8", ("V", "T", "H", "W", 4), "straight (not premultiplied) alpha; one picture is one chunk, gzip"),
-    Field("intrinsics", "f64", ("V", 3, 3), "pixels; pixel centers at +0.5"),
+    Field("intrinsics", "f64", ("V", 3, 3), "pixels, which are rectangles (no skew); centers at +0.5"),
     Field("world_to_camera", "f64", ("V", 4, 4), "rigid; camera axes are OpenCV's"),
     Field("time", "f64", ("T",), "seconds, rising"),
     Field("role", "str", ("V",), "`reference` (one: the input of video-to-4D), `train`, `test`"),
