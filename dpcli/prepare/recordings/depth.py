@@ -16,6 +16,7 @@ _OTHER_IMAGES = re.compile(
     r"colou?r|rgb|infra|mask|conf|amplitude|intensity|(?<![a-z])(ir|mono|gray|grey)(?![a-z])", re.IGNORECASE
 )
 _UNITS = "/option/Depth_Units/value"  # behind a sensor's name, as the SDK of RealSense writes it: meters per raw unit
+CHANGES = "recordings whose camera_info changes on the way, of which the first counts"
 _DISPARITY = re.compile("disp(arity|_?map)?(?![a-z])", re.IGNORECASE)
 
 
@@ -38,7 +39,9 @@ def read_recorded_depth(
             raise DataError(f"{path}: images of {name} differ in size or type: {found}; expected one kind")
         if read.frames[0].itemsize == 1 and not topic and not _SAYS_DEPTH.search(name):
             raise DataError(f"{path}: {name} holds 8-bit images, hardly depth; if they are, name it with --topic")
-        return read, _camera(recording, name), _raw_units(recording, name)
+        cameras = _cameras(recording, name)
+        read.notes |= {CHANGES: 1} if any(one != cameras[0] for one in cameras) else {}
+        return read, cameras[0] if cameras else None, _raw_units(recording, name)
 
 
 def _depth_topic(recording: Recording, topic: str) -> str:
@@ -59,9 +62,9 @@ def _depth_topic(recording: Recording, topic: str) -> str:
     return recording.choose(topic, IMAGE_KINDS, "images")
 
 
-def _camera(recording: Recording, topic: str) -> Calibration | None:
-    """Returns the camera of the camera_info that lies nearest above the topic, such as ``/camera/depth/camera_info``; of
-    several there the one whose name says depth.
+def _cameras(recording: Recording, topic: str) -> list[Calibration]:
+    """Returns the cameras of the camera_info that lies nearest above the topic, such as ``/camera/depth/camera_info``; of
+    several there the one whose name says depth. Drivers that aren't ready say zeros, which are passed over.
     """
     parts = _folder(topic, "")
     infos = [name for name, (kind, count) in recording.topics.items() if kind in CAMERA_KINDS and count]
@@ -69,8 +72,9 @@ def _camera(recording: Recording, topic: str) -> Calibration | None:
     nearest = [name for name in depth if depth[name] == max(depth.values())]
     if len(nearest) > 1:
         nearest = [name for name in nearest if _SAYS_DEPTH.search(name.rpartition("/")[2])]
-    message = next(recording.messages(nearest[0]), None) if len(nearest) == 1 else None
-    return calibration_of_message(recording.path, topic, message.content) if message else None
+    messages = recording.messages(nearest[0]) if len(nearest) == 1 else ()
+    found = (calibration_of_message(recording.path, topic, message.content) for message in messages)
+    return [camera for camera in found if camera]
 
 
 def _folder(topic: str, info: str = "info") -> list[str]:

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.cloud_formats.cloud import BEYOND
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
+from dpcli.prepare.recordings.depth import CHANGES
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
 from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED
@@ -318,6 +320,20 @@ def test_recordings_of_a_realsense_have_its_camera_and_its_units(tmp_path):
     path = write_recording(tmp_path / "two", "bag", make, [*content, (content[2][0], START + 1, units[1])])
     with pytest.raises(DataError, match=r"Depth_Units/value changes on the way \(0.0001, 0.001\)"):
         read(DepthVideos(inputs=(path,)))
+
+
+@pytest.mark.parametrize(
+    ("focal", "counts", "changes"), [((0.0, 400.0, 400.0), 400.0, False), ((500.0, 400.0), 500.0, True)]
+)
+def test_the_first_camera_that_is_calibrated_counts_and_a_change_is_told(tmp_path, focal, counts, changes):
+    make = Messages("mcap")
+    content = [("/c/depth", START, make.image(np.full((12, 16), 1000, np.uint16)))]
+    content += [
+        ("/c/camera_info", START + t, make.camera([f, 0, 8, 0, f, 6, 0, 0, 1], 16, 12)) for t, f in enumerate(focal)
+    ]
+    sample = read(DepthVideos(inputs=(write_recording(tmp_path / "run", "mcap", make, content),)))
+    np.testing.assert_allclose(sample.sequence.points[0, 0], -8 / counts, rtol=1e-6)
+    assert sample.notes == ({CHANGES: 1} if changes else {})
 
 
 def test_of_several_camera_infos_the_one_that_says_depth_counts(tmp_path):
