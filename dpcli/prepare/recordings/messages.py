@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.cloud import BEYOND, Cloud, cloud_of_columns
 from dpcli.prepare.decode.calibration import lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
@@ -39,6 +39,8 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     step, width, height = int(content.point_step), int(content.width), int(content.height)
     ends = [field.offset + np.dtype(_POINT_TYPES[field.datatype]).itemsize for field in fields.values()]
     data = np.frombuffer(memoryview(content.data), np.uint8)
+    if not (width * height or len(data)):  # some nodes send no fields where they found nothing
+        return Cloud(np.zeros((0, 3), np.float32), extra={name: np.zeros(0, np.float32) for name in keep})
     row_step = int(content.row_step) or width * step
     if max(ends, default=0) > step or width * step > row_step or len(data) < row_step * height:
         raise DataError(
@@ -59,6 +61,8 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     cloud = cloud_of_columns(path, columns, keep)
     several = (field.name for field in content.fields if field.name not in fields)  # numbers a point
     cloud.unread += tuple(several)
+    beyond = (len(data) - row_step * height) // max(step, 1)
+    cloud.dropped |= {BEYOND: beyond} if beyond else {}
     return cloud
 
 

@@ -67,13 +67,13 @@ class RecordedClouds(OwnScans):
 
     @cached_property
     def _first(self) -> tuple[bool, tuple[str, ...]]:
-        """Returns whether the first good cloud has colors, and which of its fields are not read."""
+        """Returns whether the first good cloud that saw something has colors, and which of its fields are not read."""
         for path in self._names.values():
             try:
                 with open_recording(path) as recording:
                     topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
                     clouds = (cloud_of_message(path, message.content) for message in recording.messages(topic))
-                    first = next(clouds, None)
+                    first = next((cloud for cloud in clouds if len(cloud.points)), None)
             except DataError:
                 continue  # a bad sample: the next one tells
             if first is not None:

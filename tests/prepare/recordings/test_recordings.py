@@ -162,6 +162,30 @@ def test_clouds_of_every_layout_arrive_as_they_were_sent(types, order, gap, heig
     np.testing.assert_array_equal(cloud.extra["intensity"], sent["intensity"])
 
 
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_message_without_points_and_fields_is_a_frame_in_which_nothing_was_seen(tmp_path, place):
+    make = Messages("bag")
+    kind = np.dtype([*XYZ.descr, ("rgb", "u4"), ("ring", "u1")])
+    sent = [make.cloud(points_of(4, kind, seed=t), START + t) for t in range(3)]
+    sent[place] = replace(
+        sent[place], fields=[], height=0, width=0, point_step=0, row_step=0, data=np.zeros(0, np.uint8)
+    )
+    content = [("/c", START + t, message) for t, message in enumerate(sent)]
+    reader = RecordedClouds(write_recording(tmp_path / "run", "bag", make, content), keep=("ring",))
+    sample = read(reader)
+    assert sample.notes == {"frames without points dropped": 1} and "color" in reader.fields
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [4, 4] and len(sample.sequence.extra["field_ring"]) == 8
+
+
+@pytest.mark.parametrize(("width", "height", "padding", "beyond"), [(4, 1, 0, 6), (2, 3, 3, 4), (0, 1, 0, 10)])
+def test_points_beyond_the_size_of_a_message_are_counted(width, height, padding, beyond):
+    make = Messages("mcap")
+    message = make.cloud(points_of(10), height=5 if padding else 1, padding=padding)
+    row_step = message.row_step if padding else 12 * width
+    cloud = cloud_of_message(Path("a.mcap"), replace(message, width=width, height=height, row_step=row_step))
+    assert len(cloud.points) == width * height and cloud.dropped == {BEYOND: beyond}
+
+
 def test_packed_colors_and_points_that_saw_nothing(tmp_path):
     make = Messages("mcap")
     points = points_of(4, np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("rgb", "f4")]))
