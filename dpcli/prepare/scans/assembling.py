@@ -12,7 +12,8 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.path_names import first_names
+from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.labels import LabelTable
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
@@ -30,6 +31,7 @@ COARSE = (
     "sequences whose files hold map coordinates in float32, which rounds them to 1 cm or more; write them in double"
 )
 UNREAD_COLORS = "frames with colors, which are not read, as the first of all has none"
+_LISTED = 8
 SHIFTED = "sequences shifted to their first frame's corner for precision"
 
 
@@ -103,7 +105,8 @@ def assemble(
 ) -> Sample:
     """Returns the sample of frames that were read, in their order. Raises DataError where no point is left.
 
-    color: every frame has one. time: seconds of each frame, f64 (T), or None. What is dropped is counted by reason.
+    color: every frame has one. time: seconds of each frame, f64 (T), or None. What is dropped is counted by reason; so
+    are colors and columns that the first cloud of all, whose unread ones are the item's ``unread``, doesn't have.
     """
     notes = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter(clean(clouds))))
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
@@ -122,6 +125,7 @@ def assemble(
     if lengths.unit == "m":
         notes |= _rounded(frames, each, divisor)
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
+    notes |= _further([clouds[t] for t in kept], item.extra["unread"]) if "unread" in item.extra else {}
     extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
         item.name,
@@ -134,6 +138,15 @@ def assemble(
         **describe(item),
     )
     return Sample(sequence, notes)
+
+
+def _further(clouds: list[Cloud], known: tuple[str, ...]) -> dict[str, int]:
+    """Returns a note of how many frames have columns that are not read, and that the first of all, which was told, has not."""
+    further = [names for cloud in clouds if (names := without(cloud.unread, known, tuple(cloud.extra)))]
+    if not further:
+        return {}
+    names = first_names(list(dict.fromkeys(name for one in further for name in one)), _LISTED)
+    return {f"frames with further columns ({names}), which are not read": len(further)}
 
 
 def _joined(

@@ -119,7 +119,7 @@ class CloudFolders(OwnScans):
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= notes | _further(clouds, item.extra["unread"])
+        sample.notes |= notes
         return sample
 
     def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:
@@ -143,15 +143,6 @@ class CloudFolders(OwnScans):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
         lines += about_series([(item.name, item.extra["series"]) for item in items])
         return lines + (self._table.unnamed(items) if self._table else [])
-
-
-def _further(clouds: list[Cloud], known: tuple[str, ...]) -> dict[str, int]:
-    """Returns a note of how many frames have columns that are not read, and that the first of all, which was told, has not."""
-    further = [names for cloud in clouds if (names := without(cloud.unread, known)) and len(cloud.points)]
-    if not further:
-        return {}
-    names = first_names(list(dict.fromkeys(name for one in further for name in one)), _LISTED)
-    return {f"frames with further columns ({names}), which are not read": len(further)}
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:

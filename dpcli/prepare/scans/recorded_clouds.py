@@ -82,7 +82,8 @@ class RecordedClouds(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when there is no recording."""
-        items = [Item(name, path, extra={"color": self._has_color}) for name, path in self._names.items()]
+        told = {"color": self._has_color, "unread": self._first[1]}
+        items = [Item(name, path, extra=told) for name, path in self._names.items()]
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

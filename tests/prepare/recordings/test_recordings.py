@@ -21,6 +21,7 @@ from dpcli.prepare.recordings.depth import CHANGES
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
 from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED
+from dpcli.prepare.scans.assembling import UNREAD_COLORS
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.recording_helpers import KINDS, START, TYPES, Messages, write_recording
 
@@ -137,6 +138,19 @@ def test_fields_that_are_not_read_are_named_and_colors_are_on_all_frames(tmp_pat
     assert reader.summary(reader.items()) == ["1 recording found; not read: intensity (--keep-fields)"]
     with pytest.raises(DataError, match="1 of 2 frames without colors"):
         read(RecordedClouds(write_recording(tmp_path / "two", "mcap", make, content)))
+
+
+@pytest.mark.parametrize("together", [True, False])  # in one recording, or the second in another
+def test_colors_and_fields_that_the_first_cloud_lacks_are_told(tmp_path, together):
+    make = Messages("mcap")
+    bright = np.dtype([*XYZ.descr, ("ring", "u1"), ("rgb", "u4")])
+    content = [("/c", START + t, make.cloud(points_of(4, kind), START + t)) for t, kind in enumerate((XYZ, bright))]
+    for number, part in enumerate([content] if together else [content[:1], content[1:]]):
+        write_recording(tmp_path / "raw" / str(number), "mcap", make, part)
+    reader = RecordedClouds(tmp_path / "raw")
+    told = {UNREAD_COLORS: 1, "frames with further columns (ring), which are not read": 1}
+    assert [read(reader, place).notes for place in range(1 if together else 2)] == ([told] if together else [{}, told])
+    assert "color" not in reader.fields
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
