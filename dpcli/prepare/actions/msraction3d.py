@@ -41,6 +41,8 @@ CLASS_NAMES = (
     "pick up and throw",
 )
 NAME = re.compile(r"a(\d{2})_s(\d{2})_e(\d{2})_sdepth\.(bin|mat)", re.IGNORECASE)
+_SIZE = 240, 320  # rows and columns of the pictures
+_LISTED = 8
 # (action, subject, trial) absent from the 567 published videos; trial 0 stands for all three
 ABSENT = (
     [(a, 4, 0) for a in range(1, 7)]
@@ -76,7 +78,9 @@ def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
 
 
 def read_mat(path: Path) -> np.ndarray:
-    """Reads a MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3, as depth (T,H,W), C order."""
+    """Reads a MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3, as depth (T,H,W), C order. Where 240 rows and
+    320 columns tell another order of the axes, as NumPy's users save them, it is that.
+    """
     with path.open("rb") as file:
         is_hdf5 = b"MATLAB 7.3" in file.read(20)
     depth = _read_mat73(path) if is_hdf5 else read_mat5(path, "depth")
@@ -86,6 +90,9 @@ def read_mat(path: Path) -> np.ndarray:
         depth = depth[..., None]
     if depth.ndim != 3:
         raise DataError(f"{path}: 'depth' has shape {depth.shape}; expected (height, width, frames)")
+    if [depth.shape.count(side) for side in _SIZE] == [1, 1]:
+        rows, columns = map(depth.shape.index, _SIZE)
+        depth = depth.transpose(rows, columns, 3 - rows - columns)
     check_shape(path, depth.shape[2], depth.shape[0], depth.shape[1])
     if depth.dtype.kind == "f" and not np.isfinite(depth).all():
         raise DataError(f"{path}: 'depth' holds NaN or infinity; expected finite numbers")
@@ -150,9 +157,14 @@ class MSRAction3D:
         found: dict[str, Item] = {}
         for path in sorted(files_below(folder), key=lambda p: (p.name.lower(), str(p))):
             match = NAME.fullmatch(path.name)
+            if not match:
+                continue
+            item = self._item(path, *(int(v) for v in match.groups()[:3]))
+            first = found.setdefault(item.name, item).path
             # .bin sorts before .mat: where both are present the official form wins
-            if match and path.name[:11].lower() not in found:
-                found[path.name[:11].lower()] = self._item(path, *(int(v) for v in match.groups()[:3]))
+            if first.suffix.lower() == path.suffix.lower() and not first.samefile(path):
+                problem = f"{path}: {item.name} is there twice; {first} is read"
+                found[f"{item.name} ({path})"] = Item(f"{item.name} ({path})", path, item.split, problem=problem)
         if not found:
             raise DataError(f"{folder}: no {expected} in it or below")
         return [found[name] for name in sorted(found)]
@@ -186,7 +198,7 @@ class MSRAction3D:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        expected, names = published_names(), {item.name for item in items}
+        expected, names = published_names(), {item.name for item in items if not item.problem}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}
         for split, wanted in (("train", train), ("test", set(expected) - train)):
@@ -198,4 +210,9 @@ class MSRAction3D:
                 + (f"; missing by subject {where}" if missing else "")
             )
         extra = sorted(names - set(expected))
-        return lines + ([f"not among the published: {first_names(extra, 8)}"] if extra else [])
+        lines += [f"not among the published: {first_names(extra, _LISTED)}"] if extra else []
+        taken = {item.path.resolve() for item in items}
+        files = (p for p in files_below(self.raw) if p.suffix.lower() in (".bin", ".mat"))
+        left = [p.name for p in files if p.resolve() not in taken]
+        why = "called otherwise, or beside the .bin of the same video"
+        return lines + ([f"not read, {why}: {first_names(left, _LISTED)}"] if left else [])

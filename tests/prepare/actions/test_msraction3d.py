@@ -97,6 +97,29 @@ def test_the_official_form_wins_over_the_other(tmp_path):
     assert [item.path.suffix for item in MSRAction3D(tmp_path).items()] == [".bin"]
 
 
+def test_videos_that_are_there_twice_and_files_that_are_not_read_are_named(tmp_path):
+    for folder in ("one", "two"):
+        write_msr(tmp_path / folder, ["a01_s01_e01"])
+    (tmp_path / "link").symlink_to(tmp_path / "one")
+    for name in ("a01_s01_e01_sdepth.mat", "a02_s01_e01_sdepth (1).bin", "a3_s1_e1_sdepth.bin", "README"):
+        (tmp_path / name).touch()
+    reader = MSRAction3D(tmp_path)
+    kept, twice = reader.items()
+    assert kept.path.parent.name == "link" and twice.problem.endswith(f"is there twice; {kept.path} is read")
+    lines = reader.summary([kept, twice])
+    left = "a01_s01_e01_sdepth.mat, a02_s01_e01_sdepth (1).bin, a3_s1_e1_sdepth.bin"
+    assert lines[-1] == f"not read, called otherwise, or beside the .bin of the same video: {left}"
+    assert lines[0].startswith("1 of the 567")
+
+
+@pytest.mark.parametrize("order", ["HWT", "THW", "WHT", "TWH", "HTW", "WTH"])
+def test_the_size_of_the_pictures_tells_the_order_of_the_axes(tmp_path, order):
+    path, depth = tmp_path / "a01_s01_e01_sdepth.mat", np.zeros((2, 240, 320), np.uint16)
+    depth[0, 7, 300], depth[1, 230, 9] = 5, 6
+    savemat(path, {"depth": depth.transpose(["THW".index(axis) for axis in order])})
+    np.testing.assert_array_equal(read_mat(path), depth)
+
+
 def test_a_mat_of_one_frame_lost_its_last_axis(tmp_path):
     path = tmp_path / "a01_s01_e01_sdepth.mat"
     savemat(path, {"depth": np.ones((6, 8), np.uint16)})
