@@ -34,8 +34,8 @@ def open_preprocessed(
     protocol: str = "xsub",
     scale: float | None = None,
 ) -> Reader:
-    """Returns the reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the first file
-    found.
+    """Returns the reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the names
+    of the files.
 
     Raises UsageError when an option is given that the form doesn't have. Raises DataError when the folder holds none
     of them.
@@ -54,13 +54,14 @@ def open_preprocessed(
 
 def _detect(raw: Path) -> str:
     expected = f"{PTS_LABEL}, aAA_sSS_eEE_sdepth.npz or SsssCcccPpppRrrrAaaa.npz files"
-    for path in files_below(require_folder(raw, expected)):
-        if path.name == PTS_LABEL:
-            return "pts_label"
-        for form, name in (("msraction3d", _MSR), ("ntu60", _NTU)):
-            if name.fullmatch(path.name):
-                return form
-    raise DataError(f"{raw}: no {expected} in it or below")
+    names = {"pts_label": re.compile(re.escape(PTS_LABEL)), "msraction3d": _MSR, "ntu60": _NTU}
+    files = [path.name for path in files_below(require_folder(raw, expected))]
+    forms = [form for form, name in names.items() if any(map(name.fullmatch, files))]
+    if len(forms) > 1:
+        raise DataError(f"{raw}: holds files of several forms ({', '.join(forms)}); --form says which to read")
+    if not forms:
+        raise DataError(f"{raw}: no {expected} in it or below")
+    return forms[0]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -87,17 +86,19 @@ class PtsLabel:
             return []
 
     def _is_nvgesture(self) -> bool:
-        names = {name for path in files_below(self.raw) for name in path.relative_to(self.raw).parts}
-        return any(fnmatch(name, "class_*") for name in names) and not any(fnmatch(name, "gesture_*") for name in names)
+        files = (path for path in files_below(self.raw) if path.name == FILE)
+        folders = [path.parent.relative_to(self.raw).as_posix() for path in files]
+        return any(map(_NVGESTURE.fullmatch, folders)) and not any(map(_SHREC.fullmatch, folders))
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         root = require_folder(self.raw, f"{FILE} files in folders such as gesture_1/finger_1/subject_1/essai_1")
         lists = self._list_files()
+        alone = self._is_nvgesture()
         listed = {e.folder: (s, e) for s, _, e in entries(lists) if isinstance(e, Entry)}
         items: dict[str, Item] = {}
         for path in [path for path in files_below(root) if path.name == FILE]:
-            item = self._item(path, root, listed)
+            item = self._item(path, root, listed, alone)
             if item.name in items:
                 problem = f"{path}: {item.name} is there twice; {items[item.name].path} is read"
                 item = Item(f"{item.name} ({path})", path, problem=problem)
@@ -117,13 +118,15 @@ class PtsLabel:
                 problem = f"{self.raw}: {where} names {entry.folder}, which has no {FILE}"
                 yield Item(entry.folder, self.raw, split, problem=problem)
 
-    def _item(self, path: Path, root: Path, listed: dict[str, tuple[str, Entry]]) -> Item:
+    def _item(self, path: Path, root: Path, listed: dict[str, tuple[str, Entry]], alone: bool) -> Item:
         relative = path.parent.relative_to(root).as_posix()
         if target := leads_out(path, root):
             return Item(relative, path, problem=f"{path}: a link that leads out of the data, to {target}")
         if match := _NVGESTURE.fullmatch(relative):
             label, subject = int(match[2]) - 1, int(match[3])
             problem = "" if 0 <= label < 25 else f"{path}: class {label + 1} is out of range; expected 1 to 25"
+            if not alone:
+                problem = f"{path}: of NvGesture, among SHREC'17, whose classes are others; convert it by itself"
             return Item(match[1], path, label=label, subject=subject, problem=problem)
         if match := _SHREC.fullmatch(relative):
             return self._gesture(match, path, listed)

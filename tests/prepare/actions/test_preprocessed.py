@@ -213,6 +213,26 @@ def test_pts_label_of_nvgesture(tmp_path):
     assert "nearer = larger" in PtsLabel(tmp_path).length_unit and len(PtsLabel(tmp_path).class_names) == 25
 
 
+@pytest.mark.parametrize("folder", ["", "gesture_data/"])  # the name of a folder above says nothing
+def test_pts_label_of_nvgesture_has_its_own_classes_or_is_named(tmp_path, folder):
+    write_pts(tmp_path, f"{folder}class_20/subject1_r0")
+    reader = PtsLabel(tmp_path)
+    assert reader.class_names[reader.items()[0].label] == "gesture 20" and "gray level" in reader.length_unit
+    write_pts(tmp_path, "gesture_2/finger_1/subject_1/essai_1")
+    reader = PtsLabel(tmp_path)
+    strange, own = reader.items()
+    assert "of NvGesture, among SHREC'17" in strange.problem and not own.problem
+    assert reader.class_names[own.label] == "tap, one finger"
+
+
+def test_files_of_several_forms_are_not_chosen_from(tmp_path):
+    write_pts(tmp_path, "z/class_20/subject1_r0")
+    (tmp_path / "a01_s01_e01_sdepth.npz").touch()
+    with pytest.raises(DataError, match=r"several forms \(pts_label, msraction3d\); --form says which"):
+        open_preprocessed(tmp_path)
+    assert isinstance(open_preprocessed(tmp_path, "pts_label"), PtsLabel)
+
+
 def test_points_that_were_filled_in_are_dropped(tmp_path):
     write_pts(tmp_path, A)
     array = pts(0)
