@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import Item, Sample, describe, natural_key, require_folder
 from dpcli.store import CloudSequence
 from dpcli.store.file import refuse_claim
@@ -150,28 +151,35 @@ class ModelNet40:
         if problem:
             return [Item(name, path or folder, homes[0] if homes else "", problem=problem)]
         stem = name.removesuffix(".h5").removeprefix("ply_data_")
-        return [_item(f"{stem}/{row:04d}", path, homes[0], row, int(label)) for row, label in enumerate(labels)]
+        rows = enumerate(labels.tolist())
+        return [_item(f"{stem}/{row:04d}", path, homes[0], (row, len(labels)), label) for row, label in rows]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        data, row = _clouds(item.path), item.extra["row"]
+        data, (row, labels) = _clouds(item.path), item.extra["row"]
         if row >= len(data):
             raise DataError(f"{item.path}: data has {len(data)} shapes, label has more; expected as many")
         if not np.isfinite(data[row]).all():
             raise DataError(f"{item.path}: shape {row} holds NaN or infinity; expected finite coordinates")
-        return Sample(CloudSequence.from_frames(item.name, [data[row].astype(np.float32)], **describe(item)))
+        more = len(data) - labels if row == 0 else 0  # told once of a file
+        sequence = CloudSequence.from_frames(item.name, [data[row].astype(np.float32)], **describe(item))
+        return Sample(sequence, {"shapes behind the last label left out": more} if more > 0 else {})
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
-        return [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
+        lines = [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
+        files = (path.name for path in self.raw.iterdir() if path.suffix.lower() in (".h5", ".hdf5"))
+        left = sorted(name for name in files if not _FILE.fullmatch(name))
+        return lines + ([f"not read, not called ply_data_train0.h5 or the like: {first_names(left)}"] if left else [])
 
 
-def _item(name: str, path: Path, split: str, row: int, label: int) -> Item:
-    problem = ""
+def _item(name: str, path: Path, split: str, place: tuple[int, int], label: int) -> Item:
+    """Returns the item of a shape; place: its row in the file, and how many labels that has."""
+    row, problem = place[0], ""
     if not 0 <= label < len(CLASS_NAMES):
         problem = f"{path}: label {label} of shape {row} is out of range; expected 0 to {len(CLASS_NAMES) - 1}"
-    return Item(name, path, split, label=label, extra={"row": row}, problem=problem)
+    return Item(name, path, split, label=label, extra={"row": place}, problem=problem)
 
 
 def _listed(path: Path) -> set[str] | None:

@@ -340,6 +340,17 @@ def test_modelnet40_files_that_disagree(tmp_path):
         assert words in reasons, words
 
 
+def test_modelnet40_shapes_and_files_that_are_not_read_are_told(tmp_path):
+    root = write_shapes(tmp_path / "m", {**SHAPES, "ply_data_train_2.h5": [1], "ply_data_test1.H5": [1]}, lists=False)
+    with h5py.File(root / "ply_data_train0.h5", "r+") as file:
+        del file["label"]
+        file["label"] = np.array([[3]], np.uint8)  # of three shapes
+    reader = ModelNet40(root)
+    assert reader.summary(reader.items())[2].endswith(": ply_data_test1.H5, ply_data_train_2.h5")
+    report = convert(reader, tmp_path / "out.h5")
+    assert report.written == 4 and report.notes == {"shapes behind the last label left out": 2}
+
+
 def test_modelnet40_folders_that_are_none(tmp_path):
     with pytest.raises(DataError, match="no ply_data_train0.h5"):
         ModelNet40(tmp_path).items()
