@@ -13,12 +13,12 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import open_archive
+from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
-from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_json
 
-_SPLITS = {"train": "train", "val": "validation", "test": "test"}
 _RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
 
 
@@ -30,7 +30,7 @@ def read_meta(raw: Path) -> dict[str, list[int]]:
         meta = read_json(path)
     except OSError:
         raise DataError(f"{path}: not found; expected meta.json and a folder data/ of .npz files") from None
-    good = isinstance(meta, dict) and set(meta) & set(_SPLITS)
+    good = isinstance(meta, dict) and any(map(split_called, meta))
     good = good and all(isinstance(meta[s], list) and all(type(n) is int and n >= 0 for n in meta[s]) for s in meta)
     if not good:
         raise DataError(f'{path}: expected {{"train": [numbers], "val": [...], "test": [...]}}')
@@ -127,12 +127,12 @@ class MultiBodySync:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         meta, parts = read_meta(self.raw), most_parts(self.raw)
         items = []
-        for split in (s for s in _SPLITS if s in meta):
-            for number in meta[split]:
+        for key in sorted(filter(split_called, meta), key=lambda key: SPLITS.index(split_called(key))):
+            for number in meta[key]:
                 path = self.raw / "data" / f"{number:06d}.npz"
-                problem = "" if path.is_file() else f"{path}: listed under {split!r} in meta.json, but not there"
+                problem = "" if path.is_file() else f"{path}: listed under {key!r} in meta.json, but not there"
                 name = f"{number:06d}"
-                items.append(Item(name, path, split=_SPLITS[split], extra={"parts": parts}, problem=problem))
+                items.append(Item(name, path, split=split_called(key), extra={"parts": parts}, problem=problem))
         twice = len(items) - len({item.name for item in items})
         if twice:
             raise DataError(
@@ -149,5 +149,7 @@ class MultiBodySync:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        counts = {split: sum(item.split == split for item in items) for split in _SPLITS.values()}
-        return [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
+        counts = {split: sum(item.split == split for item in items) for split in SPLITS}
+        lines = [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
+        left = sorted({path.stem for path in (self.raw / "data").glob("*.npz")} - {item.name for item in items})
+        return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])

@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
-from dpcli.path_names import path_inside
+from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 
@@ -183,4 +183,6 @@ class OgcRooms:
         ]
         if len(items) != ROOMS:
             lines.append(f"{counted(len(items), 'room')} where the published set has {ROOMS}")
-        return lines
+        folders = {path.name for path in (self.raw / "data").iterdir() if (path / "pc_00.npy").is_file()}
+        left = sorted(folders - {item.name for item in items})
+        return lines + ([f"not read, in no list: {first_names(left)}"] if left else [])

@@ -172,6 +172,19 @@ def test_missing_arrays_and_files(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "keys", [("train", "val", "test"), ("Training", "validation", "test_set"), ("0", "valid", "x")]
+)
+def test_splits_of_meta_json_in_other_words_and_samples_in_none(tmp_path, keys):
+    raw = write(tmp_path / "raw", {k: make_sample(k)[0] for k in range(4)}, {key: [k] for k, key in enumerate(keys)})
+    reader = MultiBodySync(raw)
+    known = [1] if keys[0] == "0" else [0, 1, 2]
+    items = reader.items()
+    assert [(i.name, i.split) for i in items] == [(f"{k:06d}", ("train", "validation", "test")[k]) for k in known]
+    left = ", ".join(f"{k:06d}" for k in range(4) if k not in known)
+    assert reader.summary(items)[-1] == f"not read, in no split of meta.json: {left}"
+
+
+@pytest.mark.parametrize(
     "text, words",
     [
         (None, "not found; expected meta.json"),

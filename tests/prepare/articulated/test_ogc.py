@@ -134,6 +134,12 @@ def test_lists(lists, words, tmp_path):
         OgcRooms(write_raw(tmp_path, {}, **lists)).items()
 
 
+def test_rooms_in_no_list_are_named(tmp_path):
+    rooms = {f"3_00000{k}": make_room(k)[0] for k in range(3)}
+    reader = OgcRooms(write_raw(tmp_path, rooms, train=["3_000001"]))
+    assert reader.summary(reader.items())[-1] == "not read, in no list: 3_000000, 3_000002"
+
+
 def test_a_list_cannot_lead_out_of_the_folder(tmp_path):
     write_room(tmp_path, "3_000000", make_room(0)[0])
     raw = write_raw(tmp_path / "raw", {"3_000001": make_room(0)[0]}, test=["../../3_000000", "3_000001"])
