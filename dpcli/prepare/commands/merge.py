@@ -44,6 +44,7 @@ def merge(
         return _merge_shards(inputs, output, force, resume)
     sources = [read_source(path) for path in inputs]
     for source in sources:
+        source.warn_of_others()
         if source.shard:
             log.warn(
                 f"{source.path}: is shard {source.shard} of a conversion; joined as any other file, in its own order"

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.runtime.machines.shards import Shard, shard_of
+from dpcli.runtime.progress import log
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.file import file_kind, read_positions
+from dpcli.store.schema import fields_of, find_field
 from dpcli.store.sequence import OF_PARTS
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
@@ -21,8 +24,8 @@ class Source:
     """Holds what the index of one file says; its points stay on the disk.
 
     made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped,
-    where the file is a shard. parts: how many its poses and joints have. prefix: what goes before its samples'
-    names in the joined file.
+    where the file is a shard. others: its data sets that no sample is made of. parts: how many its poses and joints
+    have. prefix: what goes before its samples' names in the joined file.
     """
 
     path: Path
@@ -37,12 +40,18 @@ class Source:
     skipped: list[tuple[str, str]] = field(default_factory=list)
     positions: tuple[list[int], list[int]] | None = None
     shard: Shard | None = None
+    others: list[str] = field(default_factory=list)
     parts: int = 0
     prefix: str = ""
 
     def sample_name(self, index: int) -> str:
         """Returns the sample's name in the joined file."""
         return self.prefix + self.names[index]
+
+    def warn_of_others(self) -> None:
+        """Tells which data sets of the file are not copied with its samples, such as those that people added."""
+        if self.others:
+            log.warn(f"{self.path}: left out, no data sets of a clouds file's samples: {first_names(self.others)}")
 
 
 def read_source(path: Path) -> Source:
@@ -53,6 +62,7 @@ def read_source(path: Path) -> Source:
         )
     with CloudsReader(path) as reader:
         root = reader.attributes
+        known = {field.name: field for field in fields_of("clouds").values() if not field.group}
         found = shard_of(reader.provenance[-1]) if reader.provenance else None
         return Source(
             path=path,
@@ -67,6 +77,7 @@ def read_source(path: Path) -> Source:
             skipped=reader.skipped,
             positions=read_positions(reader.file),
             shard=found[0] if found else None,
+            others=[name for name in reader.file if find_field(known, name) is None],
             parts=max(
                 (n for key in OF_PARTS.keys() & set(reader.fields) for n in reader.file[key].shape[1:2]), default=0
             ),

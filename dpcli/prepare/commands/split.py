@@ -135,6 +135,7 @@ def split(
     stopped or killed, it goes on from the last sample when run again.
     """
     source = read_source(path)
+    source.warn_of_others()
     with CloudsReader(path) as reader:
         splits = choice.assign(source, reader.splits, reader.subjects.tolist())
         counts = {name: splits.count(name) for name in dict.fromkeys((*SPLITS, *splits)) if name in splits}

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.commands.sources import read_source
 from dpcli.prepare.commands.split import SplitChoice, draw_splits, split, splits_by_list
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -53,6 +55,19 @@ def test_the_splits_of_the_file_itself_and_nothing_else_changes(whole, tmp_path)
             np.testing.assert_array_equal(getattr(before.read(10), key), getattr(after.read(1), key))
         assert after.class_names == ["a", "b", "c"] and after.skipped == [("gone", "why")]
         assert after.provenance[0] == {"config": {"k": 1}} and "clouds" in after.provenance[1]["inputs"]
+
+
+@pytest.mark.parametrize("name", ["times", "my_labels", "activation/static", "Color"])
+@pytest.mark.parametrize("joined", [True, False])
+def test_data_sets_that_are_not_copied_are_told(whole, tmp_path, capsys, name, joined):
+    with h5py.File(whole, "r+") as file:
+        file[name] = np.zeros(len(file["points"]), np.float32)
+    if joined:
+        merge([whole], tmp_path / "new.h5")
+    else:
+        split(whole, tmp_path / "new.h5", SplitChoice(fractions=(0.5, 0, 0.5)))
+    said = capsys.readouterr().err
+    assert said.count("left out, no data sets of a clouds file's samples: " + name.partition("/")[0]) == 1
 
 
 def test_by_subject(whole, tmp_path):
