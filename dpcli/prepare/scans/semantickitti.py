@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.prepare.scans.kitti_files import (
     IMAGE_SIZE,
@@ -71,6 +72,11 @@ def read_poses(path: Path) -> np.ndarray:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = np.reshape(rows, (-1, 3, 4))
     return poses
+
+
+def _labels_without_scan(folder: Path) -> list[str]:
+    scans = {path.stem for path in (folder / "velodyne").glob("*.bin")}
+    return sorted({path.stem for path in (folder / "labels").glob("*.label")} - scans)
 
 
 @dataclass(frozen=True)
@@ -203,6 +209,9 @@ class SemanticKitti:
         missing = [name for name in GROUPS[self.group] if name not in found]
         if missing:
             lines.append(f"sequences not there: {', '.join(missing)}")
+        lost = [f"{name}/{stem}" for name, folder in self._folders() for stem in _labels_without_scan(folder)]
+        if lost:
+            lines.append(f"{counted(len(lost), 'label file')} without a scan: {first_names(lost)}; is the copy whole?")
         left = held - len(items) * self.frames
         if left:
             lines.append(

@@ -94,6 +94,14 @@ def test_groups_of_table_4_6(tmp_path):
     assert "sequences not there: 01, 02, 03, 04, 05, 06, 07, 09" in lines
 
 
+def test_labels_whose_scans_are_not_there_are_named(tmp_path):
+    folder = write_scans(sequences(tmp_path) / "03", {f"00000{k}": visible(5) for k in range(4)})
+    for number in (1, 3):
+        (folder / "velodyne" / f"00000{number}.bin").unlink()
+    reader = SemanticKitti(tmp_path)
+    assert "2 label files without a scan: 03/000001, 03/000003; is the copy whole?" in reader.summary(reader.items())
+
+
 def test_command_windows_and_skipped(tmp_path):
     raw = tmp_path / "semantisches kitti"
     scans = {f"{n:06d}": visible(6, n) for n in range(7)}
