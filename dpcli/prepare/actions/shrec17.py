@@ -137,6 +137,9 @@ class Shrec17:
             clouds.append(self._points(depth, x, y, right, bottom))
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         kept, dropped = drop_empty_frames(str(item.path), counts)
+        more = len(ticks) - len(frames) - sum(notes.values())  # which frame a region belongs to is their order alone
+        if more > 0:
+            notes["regions beyond the frames of a sequence left out; do they belong together?"] = more
         if cut:
             notes["hand regions cut at the edge of the image"] = cut
         seconds = _frame_seconds(ticks, len(frames))

@@ -189,6 +189,17 @@ def test_frames_that_disagree_with_the_list(tmp_path):
     assert "2 of the 6 frames that the list promises are missing, the first: 4_depth.png" in reasons(reader, 1)
 
 
+@pytest.mark.parametrize("frames", [3, 2])  # that the list says, of three there
+def test_regions_beyond_the_frames_are_counted(tmp_path, frames):
+    root = make_raw(tmp_path)
+    write_lists(root, [f"1 1 2 1 1 1 {frames}"], ["14 2 28 3 14 28 3"])
+    with (root / A / "general_informations.txt").open("a") as file:
+        file.write("9e9 190 90 70 80\n9.1e9 190 90 70 80\n")
+    notes = Shrec17(root).read(Shrec17(root).items()[0], RNG).notes
+    assert notes.pop("regions beyond the frames of a sequence left out; do they belong together?") == 2
+    assert sum(notes.values()) == 3 - frames
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
