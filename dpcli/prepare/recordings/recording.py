@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from dpcli.regular_files import why_unreadable
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
+_UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE)
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
@@ -77,14 +79,28 @@ def holds_only_recordings(path: Path, others: tuple[str, ...]) -> bool:
     return not any(name.endswith(others) and not is_beside(name) for name in names)
 
 
+def unread_recordings(path: Path) -> list[str]:
+    """Returns the names of files below a path that are recordings by the middle of their names alone, sorted: those still
+    being written, packed or kept by another program (``.bag.active``, ``.mcap.gz``), which nobody reads.
+    """
+    if is_recording(path):
+        return []
+    taken = [str(one) for one in find_recordings(path)]
+    below = ((folder, name) for folder, _, names in walk_folders(path) for name in names if folder not in taken)
+    return sorted(name for _, name in below if _UNREAD.search(name) and not is_hidden(name))
+
+
 class Recording:
-    """Reads one open recording; `open_recording` makes it. ``read``: how many messages the latest pass found."""
+    """Reads one open recording; `open_recording` makes it. ``read``: how many messages the latest pass found. ``unlisted``:
+    the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
+    """
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path, self._reader, self.read = path, reader, 0
         self.topics: dict[str, tuple[str, int]] = {
             name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()
         }  # name -> (type, number of messages)
+        self.unlisted = _unlisted(path) if path.is_dir() else []
 
     def choose(self, topic: str, kinds: tuple[str, ...], what: str) -> str:
         """Returns the topic that was asked for, or the only one of these kinds.
@@ -132,6 +148,12 @@ class Recording:
         if kind in LIVOX_KINDS:
             return read_livox(raw, ros1=not self._reader.is2)
         return self._reader.deserialize(raw, kind)
+
+
+def _unlisted(folder: Path) -> list[str]:
+    text = (folder / _METADATA).read_text("utf-8", "replace")
+    names = sorted(one.name for one in folder.iterdir() if one.name.lower().endswith(_IN_FOLDERS))
+    return [name for name in names if not re.search(rf"(?<![\w.-]){re.escape(name.removesuffix('.zstd'))}", text)]
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from dpcli.prepare.recordings.recording import Message, Recording
 
 _DELAY = 10**9  # ns by which the delay from taking to recording may vary where messages overtake each other
 LACKING = "messages that recordings declare and lack"
+UNLISTED = "files in folders of ROS 2 bags left out, which their metadata.yaml doesn't list (ros2 bag reindex does)"
 SORTED = "recordings whose frames were sorted by the times in their headers"
 LOGGED = "recordings whose times are those of recording, since the times in their headers don't rise"
 SEVERAL_PLACES = "recordings whose frames come from several sensors (frame_id), each around its own origin"
@@ -47,6 +48,8 @@ def read_topic(recording: Recording, topic: str, stride: int, decode: Callable[[
     order, time, notes = message_times(stamps)
     if recording.read < declared:
         notes[LACKING] = declared - recording.read
+    if recording.unlisted:
+        notes[UNLISTED] = len(recording.unlisted)
     if len(places) > 1:
         notes[SEVERAL_PLACES] = 1
     return TopicFrames([frames[place] for place in order], time, notes)

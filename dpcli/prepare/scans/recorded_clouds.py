@@ -15,7 +15,7 @@ from dpcli.prepare.cloud_formats.cloud import without
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample
 from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
-from dpcli.prepare.recordings.recording import find_recordings, open_recording
+from dpcli.prepare.recordings.recording import find_recordings, open_recording, unread_recordings
 from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.store.schema import kept_names
@@ -105,4 +105,8 @@ class RecordedClouds(OwnScans):
         """Returns lines for the log about what the index holds."""
         unread = f"; not read: {first_names(self._first[1], _LISTED)} (--keep-fields)" if self._first[1] else ""
         lines = [f"{counted(len(items), 'recording')} found{unread}"]
+        if others := unread_recordings(self.raw):
+            lines.append(
+                f"left out, not .bag, .mcap or .db3: {first_names(others, _LISTED)}; unpack or finish them first"
+            )
         return lines + (self._table.unnamed(items) if self._table else [])

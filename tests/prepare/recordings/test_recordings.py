@@ -20,7 +20,7 @@ from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.recordings.depth import CHANGES
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
-from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED
+from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED, UNLISTED
 from dpcli.prepare.scans.assembling import UNREAD_COLORS
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.recording_helpers import KINDS, START, TYPES, Messages, write_recording
@@ -113,6 +113,29 @@ def test_frames_have_the_order_and_times_of_their_headers(tmp_path, taken, clock
     tenths = sorted(taken) if note != LOGGED else range(len(taken))
     np.testing.assert_allclose(sample.sequence.time, np.array(tenths) / 10, atol=1e-9)
     assert sample.notes == ({note: 1} if note else {})
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("packed", ["", "FILE"])
+def test_files_that_a_folder_of_ros_2_does_not_list_are_counted(tmp_path, kind, packed):
+    make = Messages(kind)
+    path = write_recording(tmp_path / "run", kind, make, scans(make, [0, 1]), packed)
+    assert read(RecordedClouds(path)).notes == {}
+    (file,) = (one for one in path.iterdir() if one.suffix != ".yaml")
+    (path / f"more_{file.name}").write_bytes(file.read_bytes())
+    assert read(RecordedClouds(path)).notes == {UNLISTED: 1}
+
+
+def test_recordings_still_written_or_packed_are_named(tmp_path):
+    make = Messages("mcap")
+    for name in ("a", "b"):
+        write_recording(tmp_path / name, "mcap", make, scans(make, [0, 1]), "FILE" if name == "b" else "")
+    for name in ("c.bag.active", "d.MCAP.gz", "e.db3.zstd", "README.bag", ".f.bag.gz", "a.bag.txt.md"):
+        (tmp_path / name).touch()
+    reader = RecordedClouds(tmp_path)
+    assert reader.summary(reader.items())[1].startswith(
+        "left out, not .bag, .mcap or .db3: c.bag.active, d.MCAP.gz, e.db3.zstd;"
+    )
 
 
 def test_scans_of_several_sensors_in_one_topic_and_lost_messages_are_told(tmp_path):
