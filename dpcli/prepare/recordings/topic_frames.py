@@ -13,8 +13,13 @@ from dpcli.errors import DataError
 from dpcli.prepare.recordings.recording import Message, Recording
 
 _DELAY = 10**9  # ns by which the delay from taking to recording may vary where messages overtake each other
+_APART = 100  # no recording is played that much faster; milli- and microseconds taken for nanoseconds are
 LACKING = "messages that recordings declare and lack"
 UNLISTED = "files in folders of ROS 2 bags left out, which their metadata.yaml doesn't list (ros2 bag reindex does)"
+PACES = (
+    "recordings whose headers' times, which count, pass a hundred times faster or slower than those of recording; if their"
+    " unit is wrong, give --fps"
+)
 SORTED = "recordings whose frames were sorted by the times in their headers"
 LOGGED = "recordings whose times are those of recording, since the times in their headers don't rise"
 SEVERAL_PLACES = "recordings whose frames come from several sensors (frame_id), each around its own origin"
@@ -66,7 +71,8 @@ def message_times(stamps: Sequence[tuple[int | None, int]]) -> tuple[list[int], 
     known = [time for time in own if time is not None]
     if len(known) == len(own):
         if _rise(known):
-            return order, _seconds(known), {}
+            spans = known[-1] - known[0], max(logged) - min(logged)
+            return order, _seconds(known), {PACES: 1} if max(spans) >= _APART * min(spans) > 0 else {}
         delays = [late - time for time, late in zip(known, logged)]
         if len(set(known)) == len(known) and max(delays) - min(delays) <= _DELAY:
             order.sort(key=lambda place: known[place])

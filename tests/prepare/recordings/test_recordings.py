@@ -20,7 +20,7 @@ from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.recordings.depth import CHANGES
 from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
-from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED, UNLISTED
+from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, PACES, SEVERAL_PLACES, SORTED, UNLISTED
 from dpcli.prepare.scans.assembling import UNREAD_COLORS
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.recording_helpers import KINDS, START, TYPES, Messages, write_recording
@@ -113,6 +113,15 @@ def test_frames_have_the_order_and_times_of_their_headers(tmp_path, taken, clock
     tenths = sorted(taken) if note != LOGGED else range(len(taken))
     np.testing.assert_allclose(sample.sequence.time, np.array(tenths) / 10, atol=1e-9)
     assert sample.notes == ({note: 1} if note else {})
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1, False), (10, False), (1000, True), (0.001, True)])
+def test_headers_whose_time_passes_at_another_pace_are_doubted(tmp_path, scale, told):
+    make = Messages("mcap")
+    content = [("/l", START + t * 10**8, make.cloud(points_of(3), 1 + round(t * 10**8 / scale))) for t in range(3)]
+    sample = read(RecordedClouds(write_recording(tmp_path / "run", "mcap", make, content)))
+    assert sample.notes == ({PACES: 1} if told else {})
+    np.testing.assert_allclose(sample.sequence.time[1], 0.1 / scale)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
