@@ -125,7 +125,7 @@ class NvGesture:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "nvgesture_train_correct_cvpr2016_v2.lst, nvgesture_test_... and Video_data/"
         folder = require_folder(self.raw, expected)
-        lists = {split: sorted(folder.glob(f"nvgesture_{split}_correct*.lst")) for split in PUBLISHED}
+        lists = {split: self._lists(split) for split in PUBLISHED}
         if not any(lists.values()):
             raise DataError(f"{folder}: no list file; expected {expected}")
         items: dict[str, Item] = {}
@@ -143,6 +143,9 @@ class NvGesture:
         if not items:
             raise DataError(f"{folder}: the list files are empty; expected one line per clip")
         return [items[name] for name in sorted(items)]
+
+    def _lists(self, split: str) -> list[Path]:
+        return sorted(self.raw.glob(f"nvgesture_{split}_correct*.lst"))
 
     def _item(self, line: str, split: str, where: str) -> Item:
         try:
@@ -203,4 +206,9 @@ class NvGesture:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
-        return [f"{split}: {found[split]} of the {count} published clips found" for split, count in PUBLISHED.items()]
+        lines = [f"{split}: {found[split]} of the {count} published clips found" for split, count in PUBLISHED.items()]
+        for *others, last in filter(None, map(self._lists, PUBLISHED)):
+            lines += (
+                [f"of several lists {last.name} is read, not {', '.join(p.name for p in others)}"] if others else []
+            )
+        return lines

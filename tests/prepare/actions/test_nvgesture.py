@@ -138,6 +138,18 @@ def test_camera_coordinates_project_back_onto_the_pixels(tmp_path):
     np.testing.assert_allclose(y / z * INTRINSICS.fy + INTRINSICS.cy, row, atol=1e-3)
 
 
+def test_of_several_lists_it_is_told_which_is_read(tmp_path):
+    root = make_raw(tmp_path, [line()], [line(start=3)])
+    assert len(NvGesture(root).summary([])) == 2
+    last = root / "nvgesture_train_correct_cvpr2016_v2_few.lst"
+    last.write_text(line(start=4))
+    reader = NvGesture(root)
+    assert [item.name for item in reader.items()] == ["class_01/subject3_r0@3", "class_01/subject3_r0@4"]
+    assert reader.summary([])[2:] == [
+        f"of several lists {last.name} is read, not nvgesture_train_correct_cvpr2016_v2.lst"
+    ]
+
+
 def test_names_splits_subjects_and_labels(tmp_path):
     videos = ["class_01/subject3_r0", "class_25/subject17_r2"]
     root = make_raw(tmp_path, [line(), line(start=1)], [line("class_25/subject17_r2", label=25)], videos)
