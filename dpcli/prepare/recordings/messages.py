@@ -35,7 +35,10 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     if isinstance(content, LivoxScan):
         return cloud_of_columns(path, content.columns, keep)
     order = ">" if content.is_bigendian else "<"
-    fields = {field.name: field for field in content.fields if field.datatype in _POINT_TYPES and field.count in (0, 1)}
+    fields: dict[str, Any] = {}
+    for field in content.fields:
+        if field.datatype in _POINT_TYPES and field.count in (0, 1):
+            fields.setdefault(field.name, field)
     step, width, height = int(content.point_step), int(content.width), int(content.height)
     ends = [field.offset + np.dtype(_POINT_TYPES[field.datatype]).itemsize for field in fields.values()]
     data = np.frombuffer(memoryview(content.data), np.uint8)
@@ -59,8 +62,8 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
     columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
     cloud = cloud_of_columns(path, columns, keep)
-    several = (field.name for field in content.fields if field.name not in fields)  # numbers a point
-    cloud.unread += tuple(several)
+    others = [field.name for field in content.fields if fields.get(field.name) is not field]
+    cloud.unread += tuple(f"{name} (again)" if name in fields else name for name in others)
     beyond = (len(data) - row_step * height) // max(step, 1)
     cloud.dropped |= {BEYOND: beyond} if beyond else {}
     return cloud

@@ -120,8 +120,7 @@ def test_headers_whose_time_passes_at_another_pace_are_doubted(tmp_path, scale, 
     make = Messages("mcap")
     content = [("/l", START + t * 10**8, make.cloud(points_of(3), 1 + round(t * 10**8 / scale))) for t in range(3)]
     sample = read(RecordedClouds(write_recording(tmp_path / "run", "mcap", make, content)))
-    assert sample.notes == ({PACES: 1} if told else {})
-    np.testing.assert_allclose(sample.sequence.time[1], 0.1 / scale)
+    assert sample.notes == ({PACES: 1} if told else {}) and np.isclose(sample.sequence.time[1], 0.1 / scale)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
@@ -277,15 +276,16 @@ def test_labels_from_folders_and_from_a_table(tmp_path):
     assert [i.label for i in RecordedClouds(tmp_path / "raw", labels=tmp_path / "t.csv").items()] == [0, 1, -1]
 
 
-def test_fields_of_several_numbers_a_point_are_told():
-    points = points_of(5)
-    message = Messages("mcap").cloud(points)
+def test_fields_of_several_numbers_a_point_and_names_that_come_again_are_told():
+    message = Messages("mcap").cloud(points_of(5))
     message.fields += [
         replace(message.fields[0], name="normal", count=3),
         replace(message.fields[0], name="odd", datatype=9),
+        replace(message.fields[0], offset=8),
     ]
     cloud = cloud_of_message(Path("a.mcap"), message)
-    assert len(cloud.points) == 5 and cloud.unread[-2:] == ("normal", "odd")
+    assert len(cloud.points) == 5 and cloud.unread == ("normal", "odd", "x (again)")
+    np.testing.assert_array_equal(cloud.points[:, 0], points_of(5)["x"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
