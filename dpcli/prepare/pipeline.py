@@ -105,7 +105,8 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     digest = hashlib.sha256("\n".join(reader.class_names).encode())
     fingerprint = cache(_fingerprint)  # items may share a folder
     for item in items:
-        facts = (item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path))
+        facts = [item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path)]
+        facts += item.extra.get("sizes", [])  # of its own files, where its path is a folder of all items
         digest.update("\n".join(map(str, facts)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}

@@ -18,6 +18,7 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
+    file_sizes,
     missing_files_problem,
     orient_points,
     read_calibration,
@@ -146,6 +147,7 @@ class KittiDetection:
                 name,
                 folder,
                 split=split.get(name, ""),
+                extra=file_sizes([folder / key / f"{name}{end}" for key, end in (*_FILES.items(), *_OTHERS.items())]),
                 problem=missing_files_problem([folder / key / f"{name}{end}" for key, end in _FILES.items()])
                 if name in present
                 else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",
@@ -205,3 +207,4 @@ class KittiDetection:
 
 
 _FILES = {"calib": ".txt", "label_2": ".txt"}
+_OTHERS = {"velodyne": ".bin", "image_2": ".png"}

@@ -14,6 +14,7 @@ from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
+    file_sizes,
     missing_files_problem,
     orient_points,
     read_calibration,
@@ -135,6 +136,7 @@ class KittiSceneFlow:
                 name,
                 folder,
                 split="train" if int(name) < TRAIN_SCENES else "test",
+                extra=file_sizes(list(self._files(folder, name).values())),
                 problem=missing_files_problem(list(self._files(folder, name).values())),
             )
             for name in names

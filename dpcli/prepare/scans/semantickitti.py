@@ -19,6 +19,7 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
+    file_sizes,
     is_no_camera,
     orient_points,
     read_calibration,
@@ -134,9 +135,10 @@ class SemanticKitti:
                 window = scans[start : start + self.frames]
                 split = "validation" if sequence == VALIDATION else "train"
                 problem = self._problem(folder, window)
-                items.append(
-                    Item(f"{sequence}_{window[0]}", folder, split=split, extra={"scans": window}, problem=problem)
-                )
+                files = [folder / "velodyne" / f"{name}.bin" for name in window]
+                files += [folder / "labels" / f"{name}.label" for name in window]
+                extra = {"scans": window, **file_sizes([*files, folder / "calib.txt", folder / "poses.txt"])}
+                items.append(Item(f"{sequence}_{window[0]}", folder, split=split, extra=extra, problem=problem))
         if not items:
             raise DataError(f"{self.raw}: no sequence holds {counted(self.frames, 'scan')} (velodyne/000000.bin ...)")
         return items

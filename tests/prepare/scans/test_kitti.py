@@ -7,6 +7,7 @@ import pytest
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.png import png_size
+from dpcli.prepare.pipeline import convert
 from dpcli.prepare.scans.kitti_det import Box, KittiDetection, parts_of_boxes, read_boxes, read_lists
 from dpcli.prepare.scans.kitti_files import (
     View,
@@ -334,6 +335,34 @@ def test_crop_is_the_definition(shared_data):
     np.testing.assert_allclose(points, camera[:, :3], atol=1e-9)
     assert len(View(far=20.0).crop(scan, to_camera, projection, (1242, 375))[1]) < len(expected)
     assert len(View().crop(scan, to_camera, projection, (600, 375))[1]) < len(expected)
+
+
+@pytest.mark.parametrize(
+    "change", ["label_2/000001.txt", "calib/000001.txt", "velodyne/000000.bin", "image_2/000000.png"]
+)
+def test_other_files_of_the_same_names_are_other_data(tmp_path, change):
+    for name in ("000000", "000001"):
+        write_detection(tmp_path, name)
+    path, out = tmp_path / "training" / change, tmp_path / "x.h5"
+    kept = path.read_bytes()
+    path.write_bytes(b"") if "velodyne" in change else path.unlink()
+    convert(KittiDetection(tmp_path), out)
+    assert convert(KittiDetection(tmp_path), out).was_complete
+    path.write_bytes(kept)
+    with pytest.raises(UsageError, match="exists, made with"):
+        convert(KittiDetection(tmp_path), out)
+
+
+@pytest.mark.parametrize("folder", ["flow_occ", "disp_occ_1", "instance"])
+def test_other_pictures_of_the_same_names_are_other_data(tmp_path, folder):
+    write_scenes(tmp_path, {"000000": make_scene(0), "000001": make_scene(1)})
+    path = tmp_path / "training" / folder / "000000_10.png"
+    kept, out = path.read_bytes(), tmp_path / "x.h5"
+    path.write_bytes(kept[:60])
+    convert(KittiSceneFlow(tmp_path), out)
+    path.write_bytes(kept)
+    with pytest.raises(UsageError, match="exists, made with"):
+        convert(KittiSceneFlow(tmp_path), out)
 
 
 def test_detection_command_lists_and_notes(tmp_path):

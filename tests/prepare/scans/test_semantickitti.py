@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.pipeline import convert
 from dpcli.prepare.scans.semantickitti import GROUPS, SemanticKitti, read_labels, read_poses
 from dpcli.store import CloudsReader
 from tests.support.kitti_helpers import P2, velodyne_to_camera, write_calibration, write_scan
@@ -100,6 +101,19 @@ def test_labels_whose_scans_are_not_there_are_named(tmp_path):
         (folder / "velodyne" / f"00000{number}.bin").unlink()
     reader = SemanticKitti(tmp_path)
     assert "2 label files without a scan: 03/000001, 03/000003; is the copy whole?" in reader.summary(reader.items())
+
+
+@pytest.mark.parametrize("change", ["labels/000001.label", "velodyne/000001.bin", "calib.txt"])
+def test_other_files_of_the_same_names_are_other_data(tmp_path, change):
+    raw, out = tmp_path / "raw", tmp_path / "x.h5"
+    path = write_scans(sequences(raw) / "00", {"000000": visible(5), "000001": visible(6)}) / change
+    kept = path.read_bytes()
+    path.write_bytes(kept + b"\n" if path.suffix == ".txt" else kept[:8])
+    convert(SemanticKitti(raw), out)
+    assert convert(SemanticKitti(raw), out).was_complete
+    path.write_bytes(kept)
+    with pytest.raises(UsageError, match="exists, made with"):
+        convert(SemanticKitti(raw), out)
 
 
 def test_command_windows_and_skipped(tmp_path):
