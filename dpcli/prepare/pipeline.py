@@ -107,6 +107,8 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     for item in items:
         facts = [item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path)]
         facts += item.extra.get("sizes", [])  # of its own files, where its path is a folder of all items
+        beside = getattr(item.extra.get("series"), "beside", None)  # times that may lie in the folder above
+        facts += beside.seconds.tolist() if beside else []
         digest.update("\n".join(map(str, facts)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}

@@ -60,6 +60,16 @@ def test_the_times_are_those_of_the_rows(tmp_path, capfd, kind, form):
     assert "its frames have the times in timestamps.txt" in said and "left out" not in said
 
 
+@pytest.mark.parametrize("kind", ["clouds", "depth"])
+@pytest.mark.parametrize("folder", ["drive", "drive/data"])
+def test_other_times_are_other_data(tmp_path, capfd, kind, folder):
+    write_frames(tmp_path / "raw" / "drive" / "data", kind, range(3))
+    for text in ("0\n0.1\n0.2", "0\n0.1\n0.3"):  # of one size
+        (tmp_path / "raw" / folder / "times.txt").write_text(text)
+        code = exit_code("prepare", kind, tmp_path / "raw", "-o", tmp_path / "a.h5")
+    assert code == 2 and "exists, made with other samples" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_texts_of_windows_are_read(tmp_path, capfd, encoding):
     write_frames(tmp_path, "clouds", range(6))
