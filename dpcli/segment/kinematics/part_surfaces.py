@@ -19,15 +19,16 @@ def part_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
-    points = np.unique(points, axis=0)
+    middle = points.mean(0)  # far from the origin Open3D's tetrahedra lose their shape
+    points = np.unique(points - middle, axis=0)
     spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1])) if len(points) > 1 else 0.0
     for mesh in (_alpha_shape, _hull):
         vertices, triangles = mesh(points, _REACH * spacing)
         if len(triangles):
-            return vertices, triangles
-    size = max(spacing, 1e-3 * float(np.abs(points).max(initial=1.0)))
+            return vertices + middle, triangles
+    size = max(spacing, 1e-3 * float(np.abs(points).max())) or 1e-3
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
-    return points.mean(0) + size * corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    return middle + points.mean(0) + size * corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
 def _alpha_shape(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:

@@ -83,7 +83,7 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def _obj(vertices: np.ndarray, triangles: np.ndarray) -> bytes:
-    lines = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in vertices]
+    lines = [f"v {_numbers(vertex)}" for vertex in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]
     return ("\n".join(lines) + "\n").encode("ascii")
 

@@ -12,6 +12,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.segment.commands.joints import find_joints
+from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code
@@ -152,6 +153,37 @@ def test_a_urdf_is_in_meters_whatever_the_clouds_are_in(few, tmp_path, dpc_here)
     widths = [max(float(line.split()[1]) for line in lines if line.startswith("v ")) for lines in meshes]
     assert np.isclose(*widths, atol=1e-3)
     assert json.loads((tmp_path / "mm.json").read_text())[0]["length_unit"] == "mm"
+
+
+@pytest.mark.parametrize("place", [1e3, -2e4])
+def test_meshes_far_from_the_origin_lie_on_the_points(place, few, tmp_path):
+    from scipy.spatial import cKDTree
+
+    with h5py.File(shutil.copyfile(few, tmp_path / "far.h5"), "r+") as file:
+        file["points"][:] = file["points"][:] + place
+        turn, middle = file["part_motion"][..., :3, :3].astype(np.float64), np.full(3, place)
+        file["part_motion"][..., :3, 3] = file["part_motion"][..., :3, 3] + middle - turn @ middle
+        name = file["name"][0].decode()
+    far = {"sequence": name, "picture": None, "force": False}
+    find_joints(str(tmp_path / "far.h5"), tmp_path / "far.urdf", **far)
+    with PartsReader(tmp_path / "far.h5") as reader:
+        sequence = reader.read(0)
+    root = int(np.bincount(sequence.part).argmax())
+    lines = (tmp_path / "far_meshes" / f"part_{root}.obj").read_text().splitlines()
+    mesh = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+    own = sequence.frame(0)[sequence.part[: len(sequence.frame(0))] == root]
+    assert np.median(cKDTree(mesh).query(own)[0]) < 0.02 and np.median(cKDTree(own).query(mesh)[0]) < 0.1
+
+
+@pytest.mark.parametrize("place", [0, 1e3, 1e6])
+@pytest.mark.parametrize("unit", [1e-3, 1, 1e3])
+@pytest.mark.parametrize("flat", [False, True])
+def test_surfaces_have_one_shape_in_any_unit_and_place(place, unit, flat):
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 3)).round(2) * ([1, 1, 0] if flat else [1, 1, 1])
+    shape, triangles = part_surface(points)
+    found, same = part_surface(unit * points + unit * place)
+    assert abs(len(same) - len(triangles)) <= 0.1 * len(triangles)
+    assert np.allclose(np.ptp(found, 0), unit * np.ptp(shape, 0), rtol=0.01)
 
 
 def test_points_that_lie_on_one_another_have_joints_without_certainty(tmp_path):
