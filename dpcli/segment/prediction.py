@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, three_nn_interpolate
+from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
@@ -82,11 +83,25 @@ def pairs_to_report(frames: int, pairs: str) -> Pairs:
 
 
 def _tracks_of(sequence: CloudSequence) -> list[np.ndarray] | None:
-    """Returns the identities i64 (N_t) of every frame's points; None without them, or where no two frames share any."""
+    """Returns the identities i64 (N_t) of every frame's points; None without them, and, with a warning, where one stands for
+    two places of a frame, or a frame has none of the frame before: these don't tell how all points move.
+    """
     if sequence.track is None:
         return None
-    tracks = np.split(sequence.track, sequence.frame_offsets[1:-1])
-    return tracks if any(np.intersect1d(one, two).size for one, two in zip(tracks, tracks[1:])) else None
+    tracks, wrong = np.split(sequence.track, sequence.frame_offsets[1:-1]), ""
+    filled = [t for t, own in enumerate(tracks) if len(own)]
+    for t, before in zip(filled, [None, *filled]):
+        identities, counts = np.unique(tracks[t], return_counts=True)
+        twice = np.isin(tracks[t], identities[counts > 1])  # the same point twice does no harm
+        places = np.unique(np.column_stack([tracks[t], sequence.frame(t)])[twice], axis=0)
+        if len(places) > (counts > 1).sum():
+            wrong = f"frame {t} has points of the same track at several places"
+        elif before is not None and not np.isin(identities, tracks[before]).any():
+            wrong = f"frame {t} has no track of frame {before}"
+        if wrong:
+            log.warn(f"{sequence.name}: its tracks are not used, and motions are searched: {wrong}")
+            return None
+    return tracks if len(filled) > 1 else None
 
 
 def _prepare_frames(

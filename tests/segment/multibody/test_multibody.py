@@ -153,6 +153,41 @@ def test_tracks_are_exact_and_may_begin_and_end():
         assert np.abs(motion[lid] - true).max() < 1e-3
 
 
+@pytest.mark.parametrize("broken", ["twice", "restart", "unknown"])
+def test_tracks_that_do_not_tell_how_all_points_move_are_not_used(broken, capsys):
+    sequence = chest(keep=True)
+    frame = np.repeat(np.arange(4), np.diff(sequence.frame_offsets))
+    track = sequence.track.copy()
+    if broken == "twice":
+        track //= 4
+    elif broken == "restart":
+        track[frame >= 2] += 1000
+    else:
+        track[::3] = -1
+    sequence.track = track
+    labels, sample = predicted(sequence)
+    warned = capsys.readouterr().err
+    assert "chest: its tracks are not used, and motions are searched: frame" in warned and warned.count("warning") == 1
+    sequence.track = None
+    same, searched = predicted(sequence)
+    assert (labels == same).all() and all(map(np.array_equal, sample.flow, searched.flow))
+    assert not capsys.readouterr().err
+
+
+def test_tracks_are_used_across_frames_without_points_and_where_points_occur_twice(capsys):
+    whole = chest(keep=True, frames=3)
+    frames, tracks = [whole.frame(t) for t in range(3)], np.split(whole.track, whole.frame_offsets[1:-1])
+    frames[1], tracks[1] = np.repeat(frames[1], 2, axis=0), np.repeat(tracks[1], 2)
+    none = np.zeros((0, 3), np.float32)
+    holed = [frames[0], none, frames[1], none, frames[2]]
+    sequence = CloudSequence.from_frames("holed", holed, track=[tracks[0], [], tracks[1], [], tracks[2]])
+    labels, sample = predicted(sequence, pairs="all")
+    places = {track: point for track, point in zip(tracks[2], frames[2])}
+    row = next(q for q, pair in enumerate(sample.pairs.tolist()) if pair == [0, 4])
+    apart = [frames[0][n] + sample.flow[row][n] - places[k] for n, k in enumerate(tracks[0]) if k in places]
+    assert np.abs(apart).max() < 1e-3 and not capsys.readouterr().err
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_small_moving_parts_of_tracks_are_found_and_nothing_else(noise):
     """A box with a knob of 12 of 500 points that turns in place, seen in six frames, each of which lacks every fifth track."""
