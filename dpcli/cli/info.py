@@ -196,7 +196,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             spread = " / ".join(f"{found[key][name]:.6g}" for name in ("min", "median", "max"))
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
     for axis, ends in found.get("range", {}).items():
-        unit = found["length_unit"] if axis in "xyz" else ""
+        unit = (found["length_unit"] or "") if axis in "xyz" else ""  # a file of others may name none
         behind = f"({unit})" if " " in unit else unit  # `0.2 300 raw depth units` would read as two numbers
         text = f"{ends[0]:.5g} to {ends[1]:.5g} {behind}".rstrip() if ends else "no finite values"
         lines.append((f"range {axis}", text))

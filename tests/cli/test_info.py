@@ -58,13 +58,17 @@ def test_text_for_people(clouds: Path) -> None:
         assert part in text
 
 
-@pytest.mark.parametrize("unit, end", [("mm", " mm"), ("300 raw depth units", " (300 raw depth units)"), ("", "")])
+@pytest.mark.parametrize(
+    "unit, end", [("mm", " mm"), ("300 raw depth units", " (300 raw depth units)"), ("", ""), (None, "")]
+)
 def test_a_unit_of_several_words_stands_apart_from_the_number(
-    clouds: Path, tmp_path: Path, unit: str, end: str
+    clouds: Path, tmp_path: Path, unit: str | None, end: str
 ) -> None:
     shutil.copy(clouds, tmp_path / "c.h5")
     with h5py.File(tmp_path / "c.h5", "r+") as file:
-        file.attrs["length_unit"] = unit
+        del file.attrs["length_unit"]
+        if unit is not None:
+            file.attrs["length_unit"] = unit
     (line,) = (
         line for line in dpc("info", tmp_path / "c.h5").stdout.decode().splitlines() if line.startswith("range x")
     )
