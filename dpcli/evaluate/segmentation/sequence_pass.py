@@ -23,6 +23,8 @@ from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 Measure = Callable[[SequencePair], dict[str, Any]]
 
+_CHOICES = {"left_out", "protocol", "split", "truth"}  # that a kept evaluation was counted with
+
 
 @dataclass(frozen=True)
 class Keeping:
@@ -77,6 +79,10 @@ def read_counted(
             f"shard {about['shard']} of an evaluation" if "shard" in about else f"an evaluation of {about.get('task')}"
         )
         raise DataError(f"{path}: holds {what}, expected the whole of one of {task}; dpc prepare merge joins shards")
+    if missing := _CHOICES - about.keys():
+        raise DataError(
+            f"{path}: its provenance lacks {', '.join(sorted(missing))}; name the parts file to count again"
+        )
     kept = {**about, "truth": Path(about["truth"]).name}
     for key, value in {**asked, "truth": truth and Path(truth).name}.items():
         if value is not None and value != kept.get(key):

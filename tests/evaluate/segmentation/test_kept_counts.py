@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
+import h5py
 import pytest
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.sequence_pass import Keeping
@@ -38,3 +41,15 @@ def test_kept_counts_answer_only_what_they_were_counted_with(files, evaluate):
     if evaluate is evaluate_segmentation:
         with pytest.raises(UsageError, match="--ignore-below 20: .* was counted with 0"):
             evaluate(kept, None, ignore_below=20)
+
+
+def test_kept_counts_without_their_choices_are_refused(files):
+    folder, parts, truth = files
+    evaluate_segmentation(parts, truth, keeping=Keeping(folder / "edited.h5"))
+    with h5py.File(folder / "edited.h5", "r+") as file:
+        *_, last = file["provenance"][:]
+        entry = json.loads(last)
+        del entry["config"]["truth"]
+        file["provenance"][-1] = json.dumps(entry)
+    with pytest.raises(DataError, match="its provenance lacks truth"):
+        evaluate_segmentation(folder / "edited.h5", None)
