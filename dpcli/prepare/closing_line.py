@@ -25,7 +25,7 @@ def closing_lines(reader: CloudsReader, notes: Mapping[str, int]) -> list[str]:
     """
     if not len(reader):
         return []
-    said = [*_lengths(reader), _frames(reader)]
+    said = [*_lengths(reader), _frames(reader), *_tracks(reader)]
     said += [f"{count} {what}" for what, count in sorted(notes.items()) if what.endswith("dropped") and count]
     return [", ".join(said), *_shifts(reader)]
 
@@ -49,6 +49,20 @@ def _lengths(reader: CloudsReader) -> list[str]:
     if not reader.shifts[places].any():  # else the origin is no sensor
         shown.insert(0, f"median distance {_number(float(median(np.array(distances))))}{unit}")
     return [*shown[:-1], f"{shown[-1]} ({reader.length_unit})"] if long else shown
+
+
+def _tracks(reader: CloudsReader) -> list[str]:
+    """Returns how long points are followed, where they have identities: one frame if these aren't the same from frame to frame."""
+    if "track" not in reader.fields:
+        return []
+    lengths, left = [], _POINTS
+    for place in _spread(len(reader), _SEQUENCES):
+        lengths.append(np.unique(reader.read(place, fields=("track",)).track, return_counts=True)[1])
+        left -= int(lengths[-1].sum())
+        if left < 0:
+            break
+    middle = float(median(np.concatenate(lengths)))
+    return [f"tracks of {_number(middle)} frame{'' if middle == 1 else 's'} (median)"]
 
 
 def _spread(count: int, wanted: int) -> list[int]:

@@ -28,7 +28,8 @@ class Cloud:
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
     coordinates are in, as in `store.schema.METERS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
     names of those that points and colors came from. unread: the names of those that nobody asked for. dropped:
-    counts of points that the file itself says don't count, by reason, and of what else it says and isn't used.
+    counts of points that the file itself says don't count, by reason, and of what else it says and isn't used. track: the
+    identities i64 (N) of the points across frames, or None.
     """
 
     points: np.ndarray
@@ -38,12 +39,14 @@ class Cloud:
     columns: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     dropped: dict[str, int] = field(default_factory=dict)
+    track: np.ndarray | None = None
 
     def keep(self, rows: np.ndarray) -> None:
         """Keeps only some points: a mask bool (N), or indices."""
         self.points = self.points[rows]
         self.color = None if self.color is None else self.color[rows]
         self.extra = {name: values[rows] for name, values in self.extra.items()}
+        self.track = None if self.track is None else self.track[rows]
 
 
 def require_points(path: Path, declared: int, found: int) -> dict[str, int]:
@@ -146,9 +149,9 @@ def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[s
     """Returns the columns that were asked for, f32 (N), by name. Raises DataError when one is missing or no numbers."""
     for name in keep:
         if name not in columns:
-            raise DataError(f"{path}: --keep-fields {name}: no such column; found {', '.join(columns) or 'no names'}")
+            raise DataError(f"{path}: no column {name} among those to read; found {', '.join(columns) or 'no names'}")
         if columns[name].dtype.kind not in "fiub" or columns[name].ndim != 1:
-            raise DataError(f"{path}: --keep-fields {name}: holds no numbers, one a point; leave it out")
+            raise DataError(f"{path}: column {name} holds no numbers, one a point; ask for another, or none")
         _require_float32(path, name, columns[name])
     return {name: columns[name].astype(np.float32) for name in keep}
 
@@ -161,7 +164,7 @@ def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
     lost = float(np.abs(known - known.astype(np.float32)).max())
     if lost > _LOST * float(np.ptp(known)):
         raise DataError(
-            f"{path}: --keep-fields {name}: float32, in which columns are kept, would round its values by up to {lost:.3g};"
+            f"{path}: column {name}: float32, in which columns are kept, would round its values by up to {lost:.3g};"
             " keep smaller numbers, such as times since the beginning"
         )
 

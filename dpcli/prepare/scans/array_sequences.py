@@ -26,6 +26,7 @@ from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.times_of_tables import seconds_of
+from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden
 from dpcli.store.schema import kept_names
 
@@ -79,6 +80,7 @@ class ArraySequences(OwnScans):
     labels: Path | None = None
     keep: tuple[str, ...] = ()
     pattern: str = ""
+    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -88,7 +90,8 @@ class ArraySequences(OwnScans):
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
         time, color = self._first
-        return (("time",) if time else ()) + (("color",) if color else ()) + kept_names(self.keep)
+        tracked = ("track",) if self.track else ()
+        return (("time",) if time else ()) + (("color",) if color else ()) + tracked + kept_names(self.keep)
 
     @cached_property
     def _paths(self) -> dict[str, Path]:
@@ -215,7 +218,9 @@ class ArraySequences(OwnScans):
             beside, axes = self._beside(item.path, arrays, source)
             frames = _frames(item.path, arrays, source, axes)
             colors = _cut(arrays[beside.colors], axes, source.place) if beside.colors else None
-            kept = {name: self._column(item.path, arrays, name, source, axes) for name in self.keep}
+            kept = {
+                name: self._column(item.path, arrays, name, source, axes) for name in with_track(self.keep, self.track)
+            }
             time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(arrays, beside, axes, source, frames)
             unit = unit_of_comments([f"units: {_told_units(arrays[source.keys[0]])}"])
@@ -236,6 +241,7 @@ class ArraySequences(OwnScans):
             )
             for t, frame in enumerate(frames)
         ]
+        identify(item.path, clouds, self.track, self.keep)
         dropped = sum(int(np.count_nonzero(~own)) for own in real)
         for cloud, own in zip(clouds, real):
             cloud.keep(own)
@@ -253,8 +259,9 @@ class ArraySequences(OwnScans):
     def _column(self, path: Path, arrays: Mapping[str, Any], name: str, source: Source, axes: str) -> np.ndarray:
         flat = tuple(length for letter, length in zip(axes, arrays[source.keys[0]].shape) if letter != "C")
         if not axes or name not in arrays or tuple(arrays[name].shape) != flat:
+            option = "--track" if name == self.track else "--keep-fields"
             raise DataError(
-                f"{path}: --keep-fields {name}: no array of one number for each point, {flat or 'as frames have'}"
+                f"{path}: {option} {name}: no array of one number for each point, {flat or 'as frames have'}"
             )
         return _cut(arrays[name], axes.replace("C", ""), source.place)
 
@@ -276,7 +283,7 @@ class ArraySequences(OwnScans):
                 used = {
                     *source.keys,
                     *beside.named(),
-                    *self.keep,
+                    *with_track(self.keep, self.track),
                     *(one.extra["source"].keys[0] for one in self._items if one.path == item.path and not one.problem),
                 }
                 unread = [name for name in arrays if name not in used]

@@ -71,6 +71,7 @@ class OwnScans:
     fps: float | None
     label_from_folder: bool
     labels: Path | None
+    track: str
     _table: LabelTable | None
 
     def __post_init__(self) -> None:
@@ -97,7 +98,8 @@ class OwnScans:
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+        left_out = ("raw", "labels", *(() if self.track else ("track",)))
+        return {k: v for k, v in asdict(self).items() if k not in left_out}
 
 
 def assemble(
@@ -133,11 +135,25 @@ def assemble(
         offsets(counts[kept]),
         time=None if time is None else time[kept],
         color=_colors(item, [clouds[t] for t in kept]) if color else None,
+        track=_tracks(item, [clouds[t] for t in kept]),
         shift=shift,
         extra=extra,
         **describe(item),
     )
     return Sample(sequence, notes)
+
+
+def _tracks(item: Item, clouds: list[Cloud]) -> np.ndarray | None:
+    """Returns the identities of all points i64 (P); None where they have none. Raises DataError where two of a frame share one."""
+    tracks = [cloud.track for cloud in clouds if cloud.track is not None]
+    for t, track in enumerate(tracks):
+        values, counts = np.unique(track, return_counts=True)
+        if counts.max() > 1:
+            raise DataError(
+                f"{item.path}: --track: {counts.max()} points of frame {t} share the identity {values[counts.argmax()]};"
+                " expected one of its own for each, the same in every frame"
+            )
+    return np.concatenate(tracks) if tracks else None
 
 
 def _further(clouds: list[Cloud], known: tuple[str, ...]) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
+from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import Series, about_series
 from dpcli.store.schema import kept_names
 
@@ -40,6 +41,7 @@ class CloudFolders(OwnScans):
     labels: Path | None = None
     keep: tuple[str, ...] = ()
     pattern: str = ""
+    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -50,13 +52,13 @@ class CloudFolders(OwnScans):
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
         kept = kept_names(self.keep)
-        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + kept
+        tracked = ("track",) if self.track else ()
+        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + tracked + kept
 
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
-        return {k: v for k, v in asdict(self).items() if k not in left_out}
+        return {k: v for k, v in super().config.items() if k != "pattern" or self.pattern}
 
     @cached_property
     def _table(self) -> LabelTable | None:
@@ -98,7 +100,7 @@ class CloudFolders(OwnScans):
                 continue  # a bad sample: the next one tells
             if cloud is None:  # nothing was seen
                 continue
-            return cloud.color is not None, without(cloud.unread, self.keep)
+            return cloud.color is not None, without(cloud.unread, with_track(self.keep, self.track))
         return False, ()
 
     def items(self) -> list[Item]:
@@ -114,7 +116,8 @@ class CloudFolders(OwnScans):
         series = item.extra["series"]
         paths = series.paths[:: self.stride]
         columns, notes = self._bin_columns(paths)
-        clouds = [read_cloud(path, columns, self.keep) for path in paths]
+        clouds = [read_cloud(path, columns, with_track(self.keep, self.track)) for path in paths]
+        identify(item.path, clouds, self.track, self.keep)
         if item.extra["color"]:
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None

@@ -18,6 +18,7 @@ from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, open_recording, unread_recordings
 from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.store.schema import kept_names
 
 _WANTED = "clouds (PointCloud2, or CustomMsg of Livox)"
@@ -37,11 +38,13 @@ class RecordedClouds(OwnScans):
     label_from_folder: bool = False
     labels: Path | None = None
     keep: tuple[str, ...] = ()
+    track: str = ""
 
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has: time, color when the very first cloud has it, what is kept."""
-        return ("time", *(("color",) if self._has_color else ()), *kept_names(self.keep))
+        tracked = ("track",) if self.track else ()
+        return ("time", *(("color",) if self._has_color else ()), *tracked, *kept_names(self.keep))
 
     @cached_property
     def _names(self) -> dict[str, Path]:
@@ -62,6 +65,10 @@ class RecordedClouds(OwnScans):
         return read_labels(self.labels) if self.labels else None
 
     @property
+    def _read(self) -> tuple[str, ...]:
+        return with_track(self.keep, self.track)
+
+    @property
     def _has_color(self) -> bool:
         return self._first[0]
 
@@ -77,7 +84,7 @@ class RecordedClouds(OwnScans):
             except DataError:
                 continue  # a bad sample: the next one tells
             if first is not None:
-                return first.color is not None, without(first.unread, self.keep)
+                return first.color is not None, without(first.unread, self._read)
         return False, ()
 
     def items(self) -> list[Item]:
@@ -91,9 +98,10 @@ class RecordedClouds(OwnScans):
         with open_recording(item.path) as recording:
             topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
             read = read_topic(
-                recording, topic, self.stride, lambda message: cloud_of_message(item.path, message.content, self.keep)
+                recording, topic, self.stride, lambda message: cloud_of_message(item.path, message.content, self._read)
             )
         clouds = read.frames
+        identify(item.path, clouds, self.track, self.keep)
         time = np.arange(len(clouds)) * self.stride / self.fps if self.fps else read.time
         if time is None:
             raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")

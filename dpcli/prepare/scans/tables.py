@@ -23,6 +23,7 @@ from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
+from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
 from dpcli.runtime.clips.other_files import stand_in
 from dpcli.store.schema import kept_names
 
@@ -47,6 +48,7 @@ class TableSequences(OwnScans):
     label_from_folder: bool = False
     labels: Path | None = None
     keep: tuple[str, ...] = ()
+    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -58,7 +60,8 @@ class TableSequences(OwnScans):
         """Returns the optional fields that every sample has."""
         kept = kept_names(self.keep)
         color, time = self._found
-        return (("time",) if time else ()) + (("color",) if color else ()) + kept
+        tracked = ("track",) if self.track else ()
+        return (("time",) if time else ()) + (("color",) if color else ()) + tracked + kept
 
     @cached_property
     def _paths(self) -> dict[str, Path]:
@@ -121,7 +124,13 @@ class TableSequences(OwnScans):
     def _load(self, path: Path) -> Loaded:
         facts = path.stat()
         return _load(
-            path, (facts.st_size, facts.st_mtime_ns), self.frame_column, self.sequence_column, self.gap, self.keep
+            path,
+            (facts.st_size, facts.st_mtime_ns),
+            self.frame_column,
+            self.sequence_column,
+            self.gap,
+            self.keep,
+            self.track,
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
@@ -134,6 +143,8 @@ class TableSequences(OwnScans):
         if item.extra["time"] and time is None:
             raise DataError(f"{item.path}: no column holds rising times, though the first table has one")
         clouds = loaded.frames(part)[:: self.stride]
+        if self.track == ROWS:
+            identify(item.path, clouds, ROWS, self.keep)
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= (
@@ -152,7 +163,7 @@ class TableSequences(OwnScans):
             first = loaded.parts[0]
             used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
             clock = used.columns if used else ()
-            unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, *clock))
+            unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, self.track, *clock))
             lines[0] += f", frames by column {loaded.column!r}"
             if clock:
                 lines[0] += f", times by column {' and '.join(map(repr, clock))}"
@@ -189,13 +200,20 @@ class Loaded:
             rows = part.rows[start:stop]
             color = None if self.cloud.color is None else self.cloud.color[rows]
             extra = {name: values[rows] for name, values in self.cloud.extra.items()}
-            found.append(Cloud(self.cloud.points[rows], color, self.cloud.unit, extra))
+            track = None if self.cloud.track is None else self.cloud.track[rows]
+            found.append(Cloud(self.cloud.points[rows], color, self.cloud.unit, extra, track=track))
         return found
 
 
 @lru_cache(maxsize=2)  # a table holds many sequences; each process reads it once
 def _load(
-    path: Path, facts: tuple[int, int], wanted: str, sequences: str, gap: float | None, keep: tuple[str, ...]
+    path: Path,
+    facts: tuple[int, int],
+    wanted: str,
+    sequences: str,
+    gap: float | None,
+    keep: tuple[str, ...],
+    track: str,
 ) -> Loaded:
     if not facts[0]:
         raise DataError(f"{path}: the file is empty")
@@ -205,6 +223,7 @@ def _load(
         raise (stand_in(path) or error) from None
     column = frame_column(table, wanted)
     cloud = cloud_of_table(table, keep)
+    cloud.track = name_rows(table, track) if track not in ("", ROWS) else None
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
     return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused, find_clocks(table, unused))

@@ -241,7 +241,7 @@ def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
 
 
 def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
-    with pytest.raises(DataError, match="--keep-fields t: float32, .* would round its values by up to 0.1;"):
+    with pytest.raises(DataError, match="column t: float32, .* would round its values by up to 0.1;"):
         read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,1700000000.0\n1,2,4,1700000000.1\n", keep=["t"])
     assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
 

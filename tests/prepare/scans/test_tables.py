@@ -187,7 +187,7 @@ def test_names_of_frame_columns(tmp_path, name):
     [
         ({"frame_column": "scan"}, "--frame-column scan: no such column; found frame, x, y, z"),
         ({"sequence_column": "run"}, "--sequence-column run: no such column"),
-        ({"keep": ("snr",)}, "--keep-fields snr: no such column"),
+        ({"keep": ("snr",)}, "no column snr among those to read"),
     ],
 )
 def test_columns_that_are_not_there(tmp_path, options, message):

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dpcli.prepare.scans.clouds import CloudFolders
     from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TableSequences
+    from dpcli.prepare.scans.tracked_points import TrackedViews
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,16 @@ class CloudUnits:
     unit: Annotated[str, typer.Option("--unit", help="Name of the output's unit of length.")] = "m"
     keep_fields: Annotated[
         str, typer.Option("--keep-fields", metavar="A,B", help="Further columns to keep, as field_A, field_B.")
+    ] = ""
+
+    track: Annotated[
+        str,
+        typer.Option(
+            "--track",
+            metavar="COLUMN|rows",
+            help="What tells which points of two frames are one: a column, or rows where each frame lists the same points in"
+            " the same order. Default: nothing; motions are searched.",
+        ),
     ] = ""
 
     @property
@@ -74,7 +85,7 @@ def clouds(
         Path,
         typer.Argument(
             help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; a table; an array of many"
-            " clouds (.npy .npz .h5 .mat); or a recording."
+            " clouds (.npy .npz .h5 .mat); a recording; or a views file with true tracks."
         ),
     ],
     units: CloudUnits,
@@ -106,6 +117,7 @@ def clouds(
         "scale": units.scale,
         "unit": units.unit,
         "keep": units.kept,
+        "track": units.track,
         "fps": fps,
         "stride": stride,
         "label_from_folder": label_from_folder,
@@ -116,17 +128,22 @@ def clouds(
 
 def _make_reader(
     raw: Path, units: CloudUnits, table: TableColumns, pattern: str, topic: str, shared: dict[str, Any]
-) -> ArraySequences | CloudFolders | TableSequences | RecordedClouds:
+) -> ArraySequences | CloudFolders | TableSequences | RecordedClouds | TrackedViews:
     """Returns the reader of recordings, of tables (those of a folder where an option says so), of arrays of many clouds, or of
     folders of frames.
     """
+    from dpcli.prepare.array_files.containers import made_by_dpc
     from dpcli.prepare.decode.cloud_files import SUFFIXES
     from dpcli.prepare.recordings.recording import holds_only_recordings
     from dpcli.prepare.scans.array_sequences import ArraySequences, holds_sequences
     from dpcli.prepare.scans.clouds import CloudFolders
     from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TABLES, TableSequences
+    from dpcli.prepare.scans.tracked_points import TrackedViews
+    from dpcli.store.file import file_kind
 
+    if made_by_dpc(raw) and file_kind(raw) == "views":
+        return TrackedViews(raw, **shared)
     if topic or holds_only_recordings(raw, SUFFIXES):
         return RecordedClouds(raw, topic, **shared)
     if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():

@@ -1,0 +1,151 @@
+"""Identities of points across frames: a column that names them, the rows of every frame, or the tracks of a views file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.counted import counted
+from dpcli.errors import DataError, UsageError
+from dpcli.path_names import as_utf8
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.scans.assembling import OwnScans
+from dpcli.prepare.scans.times_of_tables import Table
+from dpcli.store import CloudSequence
+from dpcli.store.views import ViewsReader
+
+ROWS = "rows"
+
+
+def with_track(keep: tuple[str, ...], track: str) -> tuple[str, ...]:
+    """Returns the columns to read: those to keep, and the one that names the points.
+
+    >>> with_track(("intensity",), "id"), with_track((), "rows")
+    (('intensity', 'id'), ())
+    """
+    return keep if track in ("", ROWS, *keep) else (*keep, track)
+
+
+def identify(path: Path, clouds: Sequence[Cloud], track: str, keep: tuple[str, ...]) -> None:
+    """Gives the points of one sequence's frames, as they were read and before any is left out, their identities, in place.
+
+    track: "" for none, ``rows`` where every frame lists the same points in the same order, else the name of a column of
+    whole numbers, which every cloud has among its ``extra``; it stays there only if ``keep`` names it. Raises DataError
+    where the frames can't be what ``track`` says.
+    """
+    if track == ROWS:
+        lost = next((reason for cloud in clouds for reason in cloud.dropped), "")
+        counts = sorted({len(cloud.points) for cloud in clouds})
+        if lost or len(counts) > 1:
+            why = f"reading left some out ({lost})" if lost else f"its frames have {counts[0]} to {counts[-1]} points"
+            raise DataError(
+                f"{path}: --track rows: expected the same points in the same order in every frame, but {why}"
+            )
+        for cloud in clouds:
+            cloud.track = np.arange(len(cloud.points))
+    elif track:
+        for cloud in clouds:
+            cloud.track = _whole(path, track, cloud.extra[track])
+            cloud.extra = {name: values for name, values in cloud.extra.items() if name in keep}
+
+
+def name_rows(table: Table, track: str) -> np.ndarray:
+    """Returns the identity i64 (N) of each row of a table by one of its columns: whole numbers as they are, words numbered."""
+    if track not in table.names:
+        raise DataError(
+            f"{table.path}: --track {track}: no such column; found {', '.join(table.names)[:200] or 'no names'}"
+        )
+    place = table.names.index(track)
+    try:
+        return _whole(table.path, track, table.columns([place])[:, 0])
+    except DataError:
+        words = np.array(table.words(place))
+        if (words == "").any() or any(word[0].isdigit() for word in set(words.tolist())):
+            raise
+        return np.unique(words, return_inverse=True)[1].reshape(-1)
+
+
+def _whole(path: Path, track: str, values: np.ndarray) -> np.ndarray:
+    if not np.isfinite(values).all() or (values != np.floor(values)).any():
+        raise DataError(f"{path}: --track {track}: expected a whole number for every point, the same in every frame")
+    return values.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class TrackedViews(OwnScans):
+    """Reads the true tracks of a `views` file, such as of an animated mesh, as a cloud of M points in every frame, with their
+    identities and parts; the options are those of `CloudFolders`. Lengths are the views file's.
+    """
+
+    raw: Path
+    scale: float | None = None
+    unit: str = "m"
+    fps: float | None = None
+    stride: int = 1
+    label_from_folder: bool = False
+    labels: Path | None = None
+    keep: tuple[str, ...] = ()
+    track: str = ""
+
+    def __post_init__(self) -> None:
+        self.check_options()
+        if self.keep or self.label_from_folder or self.track not in ("", ROWS):
+            raise UsageError(
+                f"{self.raw}: holds views and their true tracks; leave out --keep-fields, --label-from-folder, --track"
+            )
+
+    @cached_property
+    def _table(self) -> LabelTable | None:
+        return read_labels(self.labels) if self.labels else None
+
+    @cached_property
+    def fields(self) -> tuple[str, ...]:
+        """Returns the optional fields that the sample has."""
+        with ViewsReader(self.raw) as views:
+            return ("time", *views.fields)
+
+    @property
+    def length_unit(self) -> str:
+        """Returns the unit that the option names, unless it is the default; then the views file's, "" where it tells none."""
+        with ViewsReader(self.raw) as views:
+            return self.unit if self.unit != "m" else views.header.length_unit
+
+    def items(self) -> list[Item]:
+        """Returns the one sample, named as the views are. Raises DataError where they have no tracks."""
+        with ViewsReader(self.raw) as views:
+            if "track" not in views.fields:
+                raise DataError(
+                    f"{self.raw}: views without true tracks, from which no clouds can be made; `dpc generate4d fit` makes a"
+                    " scene of them, and `dpc generate4d export --as clouds` its clouds"
+                )
+            items = [Item(as_utf8(views.header.name), self.raw)]
+        return self._table.apply(items) if self._table else items
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample. Raises DataError when its data are bad."""
+        with ViewsReader(item.path) as views:
+            track, part = views.track[:: self.stride], views.part
+            time = views.header.time[:: self.stride]
+        frames, points = track.shape[:2]
+        sequence = CloudSequence(
+            item.name,
+            (track.reshape(-1, 3) / (self.scale or 1.0)).astype(np.float32),
+            np.arange(frames + 1, dtype=np.int64) * points,
+            time=np.arange(frames) * self.stride / self.fps if self.fps else time,
+            track=np.tile(np.arange(points), frames),
+            part=None if part is None else np.tile(part, frames),
+            **describe(item),
+        )
+        return Sample(sequence)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the file holds."""
+        with ViewsReader(self.raw) as views:
+            frames, points = views.track.shape[:2]
+        return [f"the true tracks of {counted(points, 'point')} in {counted(frames, 'frame')} of views"]

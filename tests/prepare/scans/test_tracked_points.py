@@ -1,0 +1,115 @@
+"""Identities of points: they reach the file from columns, rows and views, or a sentence says why not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.store import CloudsReader
+from dpcli.store.views import ViewsReader
+from tests.support.commands import exit_code
+
+_FRAMES, _POINTS = 5, 12
+
+
+@pytest.fixture
+def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Returns what a command says that must end with an error."""
+
+    def run_refused(*words: object) -> str:
+        assert exit_code(*words)
+        return " ".join(capfd.readouterr().err.split())
+
+    return run_refused
+
+
+def _moving(rng: np.random.Generator) -> np.ndarray:
+    return (rng.normal(size=(1, _POINTS, 3)) + 0.1 * np.arange(_FRAMES)[:, None, None]).astype(np.float32)
+
+
+def _table(path: Path, names: list[str], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Writes a table whose rows are shuffled within each frame and lack some points; returns the places of each name."""
+    points, lines = _moving(rng), ["frame,marker,x,y,z"]
+    for t in range(_FRAMES):
+        for k in rng.permutation(_POINTS)[: _POINTS - t % 3]:
+            lines.append(f"{t},{names[k]},{','.join(f'{value:.6f}' for value in points[t, k])}")
+    path.write_text("\n".join(lines) + "\n")
+    return {name: points[:, k] for k, name in enumerate(names)}
+
+
+@pytest.mark.parametrize("words", [False, True])
+def test_column_of_table_names_points(tmp_path: Path, words: bool, capfd: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    names = [f"marker_{k:02d}" if words else str(7 * k + 20_000_001) for k in range(_POINTS)]
+    truth = _table(tmp_path / "walk.csv", names, rng)
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "walk.csv", "--track", "marker", "-o", tmp_path / "out.h5")
+    assert "tracks of 5 frames (median)" in capfd.readouterr().err
+    with CloudsReader(tmp_path / "out.h5") as clouds:
+        sequence = clouds.read(0)
+    for t in range(_FRAMES):
+        rows = slice(*sequence.frame_offsets[t : t + 2])
+        for identity, point in zip(sequence.track[rows], sequence.points[rows], strict=True):
+            name = names[identity] if words else str(identity)
+            np.testing.assert_allclose(point, truth[name][t], atol=1e-5)
+
+
+def test_rows_name_points_though_some_are_no_measurement(tmp_path: Path) -> None:
+    points = _moving(np.random.default_rng(4))
+    points[2, 5] = np.nan
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    for t in range(_FRAMES):
+        np.save(folder / f"{t:03d}.npy", points[t])
+    np.save(tmp_path / "all.npy", points)
+    for raw in (folder, tmp_path / "all.npy"):
+        assert 0 == exit_code("prepare", "clouds", raw, "--track", "rows", "-o", tmp_path / "out.h5", "--force")
+        with CloudsReader(tmp_path / "out.h5") as clouds:
+            sequence = clouds.read(0)
+        assert np.diff(sequence.frame_offsets).tolist() == [12, 12, 11, 12, 12]
+        frame = np.repeat(np.arange(_FRAMES), np.diff(sequence.frame_offsets))
+        np.testing.assert_array_equal(sequence.points, points[frame, sequence.track])
+
+
+def test_what_cannot_be_an_identity_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+    points = _moving(np.random.default_rng(5))
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    for t in range(_FRAMES):
+        np.save(folder / f"{t:03d}.npy", points[t, : _POINTS - t])
+    scan = ("prepare", "clouds", folder, "-o", tmp_path / "out.h5", "--track", "rows")
+    assert "its frames have 8 to 12 points" in refused(*scan)
+    _table(tmp_path / "walk.csv", ["1"] * _POINTS, np.random.default_rng(6))
+    table = ("prepare", "clouds", tmp_path / "walk.csv", "-o", tmp_path / "out.h5", "--track")
+    assert "12 points of frame 0 share the identity 1" in refused(*table, "marker")
+    assert "expected a whole number for every point" in refused(*table, "x")
+    assert "no such column; found frame, marker, x, y, z" in refused(*table, "joint")
+
+
+def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., str]) -> None:
+    assert 0 == exit_code(
+        "prepare",
+        "synthetic",
+        "animal",
+        "-o",
+        tmp_path / "views.h5",
+        "--size",
+        "16",
+        "--frames",
+        "4",
+        "--tracks",
+        "200",
+    )
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "views.h5", "-o", tmp_path / "out.h5")
+    with ViewsReader(tmp_path / "views.h5") as views, CloudsReader(tmp_path / "out.h5") as clouds:
+        sequence = clouds.read(0)
+        np.testing.assert_array_equal(sequence.points.reshape(4, 200, 3), views.track)
+        np.testing.assert_array_equal(sequence.part.reshape(4, 200), np.tile(views.part, (4, 1)))
+        np.testing.assert_array_equal(sequence.track.reshape(4, 200), np.tile(np.arange(200), (4, 1)))
+        np.testing.assert_array_equal(sequence.time, views.header.time)
+    assert 0 == exit_code(
+        "prepare", "synthetic", "animal", "-o", tmp_path / "bare.h5", "--size", "16", "--frames", "2", "--tracks", "0"
+    )
+    assert "views without true tracks" in refused("prepare", "clouds", tmp_path / "bare.h5", "-o", tmp_path / "none.h5")
