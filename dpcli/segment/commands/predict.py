@@ -213,8 +213,8 @@ def _predict_sequences(
         taken.run(work, load, write, workers)
     if fewer:
         log.warn(
-            f"{reader.path}: fewer than the {wanted_parts} parts of --parts, since some had too few points, in"
-            f" {first_names(fewer)}; --set smallest=0 --set smallest_cluster=0 keeps the smallest"
+            f"{reader.path}: fewer than the {wanted_parts} parts of --parts in {first_names(fewer)}: too few different points,"
+            " or parts too small to be kept (--set smallest=0 --set smallest_cluster=0 keeps them)"
         )
 
 
