@@ -61,6 +61,13 @@ def from_environment() -> Processes:
         raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is not a number; start with torchrun, or unset them") from None
 
 
+def refuse_several(command: str) -> None:
+    """Raises UsageError where torchrun started several processes of a command that trains in one."""
+    count = from_environment().count
+    if count > 1:
+        raise UsageError(f"{command} trains in one process, but torchrun started {count}; run it without torchrun")
+
+
 @contextmanager
 def process_group(device: torch.device) -> Iterator[Processes]:
     """Joins the other processes for the length of a block: NCCL between GPUs, gloo between CPUs."""

@@ -41,7 +41,10 @@ class Refinement:
     vote: bool = setting(True, "Blend each frame's mask with its neighbors', carried along the flow.")
     split_bodies: bool = setting(True, "Divide a part of the network's whose points move as several rigid bodies.")
     smallest: float = setting(
-        0.03, "Parts below this share of a sequence's points are given to each point's next best part.", least=0
+        0.03,
+        "Parts below this share of a sequence's points are given to each point's next best part; with --parts N at most"
+        " 1 / 2N.",
+        least=0,
     )
     normalize: bool = setting(True, "Scale each sequence to diameter 1 before it is looked at.")
 

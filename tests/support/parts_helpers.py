@@ -78,7 +78,8 @@ def perfect(truth: CloudSequence, num_parts: int, pairs: np.ndarray = CHAIN, slo
 
 
 def write_parts(path: Path, samples: list[tuple], num_parts: int = 4, **options) -> Path:
-    with PartsWriter(path, num_parts=num_parts, class_names=CLASS_NAMES, length_unit="m", **options) as writer:
+    options = {"class_names": CLASS_NAMES, "length_unit": "m", **options}
+    with PartsWriter(path, num_parts=num_parts, **options) as writer:
         for sample in samples:
             writer.write(*sample)
     return path

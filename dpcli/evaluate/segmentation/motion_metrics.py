@@ -18,8 +18,10 @@ from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.part_matching import hungarian_matching
 from dpcli.evaluate.segmentation.part_overlap import overlap
 from dpcli.evaluate.segmentation.rigid_motion import rotation_angle
+from dpcli.store.schema import METERS
 
-TAUS = (0.01, 0.05)  # length units: the released scale of SAPIEN and OGC-DR; of KITTI, Waymo and the thesis's text
+# meters, or units that are no known length (diameters)
+TAUS = (0.01, 0.05)  # the released scale of SAPIEN and OGC-DR; of KITTI, Waymo and the thesis's text
 MAIN_TAU = {"dpc": 0.05, "release": 0.01}  # the thesis's text; what its code takes on SAPIEN and OGC-DR
 RELEASE_BATCH = 6  # frame pairs
 SHARES = ("accs", "accr", "outlier")
@@ -93,11 +95,11 @@ def end_point_errors(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(predicted - truth.astype(np.float64), axis=1)
 
 
-def flow_update(predicted: np.ndarray, truth: np.ndarray) -> MotionStatistics:
-    """Returns the statistics of one frame pair from predicted and true flow f (N,3) in length units.
+def flow_update(predicted: np.ndarray, truth: np.ndarray, meters: float = 1.0) -> MotionStatistics:
+    """Returns the statistics of one frame pair from predicted and true flow f (N,3) in length units of so many meters.
 
     AccS, AccR and Outlier count points by absolute error at each of TAUS, or by the error relative to the true flow's
-    length. Raises DataError on other shapes.
+    length. A unit that is no known length counts as a meter. Raises DataError on other shapes.
 
     >>> found = motion_compute(flow_update(np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([[1.0, 0, 0], [0, 1, 0]])))
     >>> found.epe3d, found.shares[0.05].accs, found.shares[0.05].accr, found.shares[0.05].outlier
@@ -105,7 +107,7 @@ def flow_update(predicted: np.ndarray, truth: np.ndarray) -> MotionStatistics:
     """
     error, length = end_point_errors(predicted, truth), np.linalg.norm(truth.astype(np.float64), axis=1)
     relative = error / (length + _TINY)
-    hits = [_threshold_hits(error, relative, tau) for tau in TAUS]
+    hits = [_threshold_hits(error * meters, relative, tau) for tau in TAUS]
     none = np.zeros(0)
     return MotionStatistics(
         np.array([len(truth)]),
@@ -115,6 +117,15 @@ def flow_update(predicted: np.ndarray, truth: np.ndarray) -> MotionStatistics:
         none,
         none,
     )
+
+
+def tau_unit(length_unit: str) -> str:
+    """Returns the unit of tau in a file of a unit of length: the meter for all known lengths.
+
+    >>> tau_unit("mm"), tau_unit("object diameter")
+    ('m', 'object diameter')
+    """
+    return "m" if length_unit in METERS else length_unit
 
 
 def _threshold_hits(error: np.ndarray, relative: np.ndarray, tau: float) -> list[int]:

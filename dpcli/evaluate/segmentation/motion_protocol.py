@@ -27,6 +27,7 @@ from dpcli.evaluate.segmentation.motion_metrics import (
 from dpcli.evaluate.segmentation.rigid_motion import true_flow, true_motion
 from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Counted, Keeping, count_sequences, read_counted
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair, named_truth
+from dpcli.store.schema import METERS
 
 
 @dataclass
@@ -84,7 +85,8 @@ def evaluate_motion(
         ) as paired:
             from_poses = "pose" in paired.fields
             about = {"task": "motion", "protocol": protocol, "from_poses": from_poses}
-            measure = partial(_sequence_values, from_poses=from_poses, truth=str(truth))
+            meters = METERS.get(paired.truth.length_unit, 1.0)
+            measure = partial(_sequence_values, from_poses=from_poses, truth=str(truth), meters=meters)
             counted = count_sequences(paired, measure, about, keeping)
     return _make_report(counted, path, resampling or Resampling(0))
 
@@ -121,11 +123,12 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
     )
 
 
-def _sequence_values(pair: SequencePair, from_poses: bool, truth: str) -> dict[str, Any]:
+def _sequence_values(pair: SequencePair, from_poses: bool, truth: str, meters: float) -> dict[str, Any]:
     predicted = len(pair.parts.pairs)
     pair = pair if from_poses else _only_next_frames(pair)
     values = {"label": pair.truth.label, "pairs": pair.parts.pairs, "predicted_pairs": predicted}
-    return values | {"statistics": vars(_sequence_statistics(pair, Path(truth))) if len(pair.parts.pairs) else {}}
+    statistics = vars(_sequence_statistics(pair, Path(truth), meters)) if len(pair.parts.pairs) else {}
+    return values | {"statistics": statistics}
 
 
 def _check_found(statistics: list[MotionStatistics], without_truth: int, path: str | Path) -> None:
@@ -148,14 +151,15 @@ def _only_next_frames(pair: SequencePair) -> SequencePair:
     return replace(pair, parts=replace(parts, pairs=parts.pairs[rows], motion=parts.motion[rows], flow=flow))
 
 
-def _sequence_statistics(pair: SequencePair, truth: Path) -> MotionStatistics:
+def _sequence_statistics(pair: SequencePair, truth: Path, meters: float) -> MotionStatistics:
+    compare = _compare_with_poses if pair.truth.pose is not None else _compare_with_flow
     try:
-        return merge_statistics(_compare_with_poses(pair) if pair.truth.pose is not None else _compare_with_flow(pair))
+        return merge_statistics(compare(pair, meters))
     except DataError as error:
         raise DataError(f"{truth}: {error}; make the file again") from None
 
 
-def _compare_with_poses(pair: SequencePair) -> Iterator[MotionStatistics]:
+def _compare_with_poses(pair: SequencePair, meters: float) -> Iterator[MotionStatistics]:
     truth, parts = pair.truth, pair.parts
     if truth.part.max() >= truth.pose.shape[1]:
         raise DataError(f"part {truth.part.max()}, but there are poses of {truth.pose.shape[1]} parts")
@@ -164,12 +168,12 @@ def _compare_with_poses(pair: SequencePair) -> Iterator[MotionStatistics]:
         points, part, predicted = truth.points[span], truth.part[span], pair.predicted.part[span]
         known = part >= 0
         real = true_motion(truth.pose, source, target)
-        compared = flow_update(flow[known], true_flow(points[known], part[known], real))
+        compared = flow_update(flow[known], true_flow(points[known], part[known], real), meters)
         yield replace(compared, unknown=int((~known).sum()))
         yield part_motion_update(points, part, predicted, real, motions)
 
 
-def _compare_with_flow(pair: SequencePair) -> Iterator[MotionStatistics]:
+def _compare_with_flow(pair: SequencePair, meters: float) -> Iterator[MotionStatistics]:
     """Compares pairs f -> f + 1 with scene_flow, which every point has."""
     truth = pair.truth
     for (source, _), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
@@ -177,4 +181,4 @@ def _compare_with_flow(pair: SequencePair) -> Iterator[MotionStatistics]:
         if not np.isfinite(real).all():
             wrong = int((~np.isfinite(real)).any(axis=1).sum())
             raise DataError(f"the true flow of {wrong} of the {len(real)} points of frame {source} is NaN or infinite")
-        yield flow_update(flow, real)
+        yield flow_update(flow, real, meters)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.evaluate.results import left_out_note
-from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, SHARES, TAUS, MotionMetrics, flow_keys
+from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, SHARES, TAUS, MotionMetrics, flow_keys, tau_unit
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.tables import class_rows, interval_tables
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
@@ -73,7 +73,8 @@ def motion_notes(report: MotionReport) -> list[str]:
         f"Split {report.split!r}, truth: {report.truth}. {counted(main.pairs, 'frame pair')} of {counted(report.sequences, 'sequence')}; "
         f"means {how}. no motion: EPE3D of predicting none.",
         "At tau: AccS error < tau or 5 %, AccR < 2 tau or 10 %, Outlier > 6 tau or 10 % of the true flow. The published "
-        "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05.",
+        "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05. Unit of tau: "
+        f"{tau_unit(report.length_unit) or 'that of the file'}.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         _DISPLACEMENT if report.from_poses else _NO_POSES,
     ]

@@ -11,7 +11,7 @@ import numpy as np
 from dpcli.evaluate.choices import SEGMENTATION_METRICS
 from dpcli.evaluate.results import class_rows_json, intervals_json, left_out_json, none_if_nan, samples_json
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
-from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics
+from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics, tau_unit
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import FIXES, SegmentationReport
 
@@ -84,7 +84,7 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
             "epe3d": unit,
             "epe3d_no_motion": unit,
             **dict.fromkeys(SHARES, "fraction"),
-            "tau": unit,
+            "tau": tau_unit(unit),
             "part_rotation": "degree",
             "part_displacement": unit,
         },

@@ -45,7 +45,9 @@ class ClassicalSettings:
     )
     max_parts: int = setting(8, "Most parts where a classical --method finds their number.", least=1)
     smallest_cluster: float = setting(
-        0.02, "Parts of a smaller share of a frame's points join their neighbor (--method).", least=0
+        0.02,
+        "Parts of a smaller share of a frame's points join their neighbor (--method); with --parts N at most 1 / 2N.",
+        least=0,
     )
     max_points: int = setting(1024, "Frames of more points are divided on a sample of this size (--method).", least=2)
     eps: float = setting(0.1, "dbscan: distance within which points are neighbors, in diameters.", above=0)
@@ -89,9 +91,19 @@ class ClassicalSettings:
             return f"{name} belongs to --method {' or '.join(owners)}; {self.method} finds its own number of parts"
         return f"{name} belongs to --method {' or '.join(owners)}; {self.method} has {', '.join(METHODS[self.method])}"
 
+    def least_share(self, smallest: float) -> float:
+        """Returns the share of the points below which parts are given up: `smallest`, but where the number of parts is given,
+        at most half of what each would have if all were equally large. Else 40 parts asked for could not all be found.
+
+        >>> ClassicalSettings(method="ward", parts=40).least_share(0.03)
+        0.0125
+        """
+        return smallest if self.parts is None else min(smallest, 0.5 / self.parts)
+
     def used(self) -> dict[str, Any]:
         """Returns the settings that the method reads, by name, with those that are left to it resolved."""
         own = {name: getattr(self, name) for name in ("method", "parts", *_SHARED, *METHODS[self.method])}
+        own["smallest_cluster"] = self.least_share(self.smallest_cluster)
         if self.motion == "auto":
             own["motion"] = _MOTION[self.method]
         if own.get("fewest", 0) is None:

@@ -56,7 +56,7 @@ class FlowOfSequence:
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
         drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
         if self.as_points:
-            drawn.points, drawn.scene_flow = flow_as_points(drawn), None
+            drawn.points, drawn.scene_flow, drawn.shift = flow_as_points(drawn), None, None  # vectors are at no place
         return drawn
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from dpcli.draw.learning_curves import Curve, Panel, draw_learning_curves
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
+from dpcli.runtime.distributed import refuse_several
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
@@ -25,6 +26,7 @@ def train_flow_estimator(
 
     Running again continues a stopped run of the same settings. Raises UsageError where the folder holds another run.
     """
+    refuse_several("segment flow")
     chosen = choose_device(device)
     with input_file(data) as path:
         reader = CloudsReader(path)

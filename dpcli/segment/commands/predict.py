@@ -20,6 +20,7 @@ from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
+from dpcli.segment.baselines.settings import ClassicalSettings
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.model_file import default_model
@@ -97,7 +98,7 @@ def predict_file(
     segmenter = _open_segmenter(settings, model, device, seed)
     place = model and str(Path(model).resolve() if Path(model).exists() else model)  # workers may stand elsewhere
     open_segmenter = partial(_open_segmenter, settings, place, device, seed)
-    refinement = settings.refinement
+    refinement = replace(settings.refinement, smallest=settings.classical.least_share(settings.refinement.smallest))
     if not isinstance(segmenter, NetworkSegmenter):
         refinement = replace(refinement, split_bodies=False)
     keep_freed_memory()
@@ -138,7 +139,7 @@ def predict_file(
                 force=force,
                 resume=output != "-",
             ) as writer:
-                _predict_sequences(reader, sequences, work, writer, fields, spread)
+                _predict_sequences(reader, sequences, work, writer, fields, spread, settings.classical)
         return _close(target, drawings, settings.classical.method == "scene")
 
 
@@ -190,11 +191,16 @@ def _predict_sequences(
     writer: PartsWriter,
     fields: list[str],
     spread: Spread,
+    classical: ClassicalSettings,
 ) -> None:
-    """Writes the parts of the sequences that an earlier run has not written."""
+    """Writes the parts of the sequences that an earlier run has not written; warns of those with fewer than --parts asks for."""
+    wanted_parts = 0 if classical.method == "dbscan" else classical.parts or 0  # the most that dbscan may find
+    fewer: list[str] = []
 
     def write(place: int, done: tuple[CloudSequence, PartsSample]) -> dict[str, float]:
         sequence, sample = done
+        if len(np.unique(sequence.part)) < wanted_parts:
+            fewer.append(sequence.name)
         writer.write(sequence, sample.probability, sample.pairs, sample.motion, sample.flow)
         return {"frames": sequence.num_frames}
 
@@ -205,6 +211,11 @@ def _predict_sequences(
     taken = ItemPass(writer, names, Wording("segment predict", "sequence", "divided"), spread.shard)
     with spread.workers() as workers:
         taken.run(work, load, write, workers)
+    if fewer:
+        log.warn(
+            f"{reader.path}: fewer than the {wanted_parts} parts of --parts in {first_names(fewer)}: too few different points,"
+            " or parts too small to be kept (--set smallest=0 --set smallest_cluster=0 keeps them)"
+        )
 
 
 def told_of_scenes(parts: str) -> list[str]:

@@ -13,6 +13,7 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
+from dpcli.runtime.distributed import refuse_several
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
@@ -38,6 +39,7 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
 
     Running again continues a stopped run of the same settings. Raises UsageError where the folder holds another run.
     """
+    refuse_several("segment train")
     chosen, supervised = choose_device(device), settings.objective.supervised
     config = settings.network.config()
     with input_file(data) as path:

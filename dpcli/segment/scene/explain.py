@@ -26,7 +26,8 @@ class SceneExplanation:
 
     pose: f64 (T,4,4), frame to world, in the input's own coordinates and unit; objects: motion f64 (4,4) in that world
     from its first frame to each that it was met in; confidence: of each, 0.5 to 1. apart: frames that overlap with none
-    before them. dropped: objects beyond the most that are kept.
+    before them. dropped: objects beyond the most that are kept. ground_seen: whether a plane showed what is up; sensor_known:
+    whether one of the places fits. Both are true where no two frames were compared.
     """
 
     labels: list[np.ndarray]
@@ -35,6 +36,8 @@ class SceneExplanation:
     confidence: list[float]
     apart: list[int]
     dropped: int
+    ground_seen: bool = True
+    sensor_known: bool = True
 
     def motion(self, part: int, source: int, target: int) -> np.ndarray:
         """Returns the rigid motion f64 (4,4) of a part, 0 for what stands, from one frame's coordinates to another's.
@@ -56,9 +59,9 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
     filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
     poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
-    dropped = 0
+    dropped, ground_seen = 0, True
     if len(filled) > 1:
-        world, own, turn, apart = _build_world([frames[t] for t in filled], sensor, settings)
+        world, own, turn, apart, ground_seen = _build_world([frames[t] for t in filled], sensor, settings)
         every = find_moving_objects(world, settings)
         found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
         for number, one in enumerate(found, 1):
@@ -68,7 +71,8 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
         poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
         objects = [_in_input_axes(one, filled, turn) for one in found]
     confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
-    return SceneExplanation(labels, poses, objects, confidence, [filled[t] for t in apart], dropped)
+    known = len(filled) < 2 or world.frames[0].origin is not None
+    return SceneExplanation(labels, poses, objects, confidence, [filled[t] for t in apart], dropped, ground_seen, known)
 
 
 def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:
@@ -78,12 +82,15 @@ def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> di
 
 def _build_world(
     frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings
-) -> tuple[World, np.ndarray, np.ndarray, list[int]]:
-    """Returns the registered frames, their poses f64 (T,4,4) in upright axes, the turn (4,4) to these, and frames apart."""
+) -> tuple[World, np.ndarray, np.ndarray, list[int], bool]:
+    """Returns the registered frames, their poses f64 (T,4,4) in upright axes, the turn (4,4) to these, frames apart, and
+    whether a ground was seen.
+    """
     largest = max(frames, key=len)
     eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
     turn = np.eye(4)
-    turn[:3, :3] = level(find_up(largest, eye)[0])
+    up, ground_seen = find_up(largest, eye)
+    turn[:3, :3] = level(up)
     upright = [frame @ turn[:3, :3].T for frame in frames]
     heights = [height_above_ground(frame) for frame in upright]
     poses, overlap = register_frames(upright, [height < settings.ground for height in heights])
@@ -97,7 +104,8 @@ def _build_world(
         )
         for frame, height, pose in zip(upright, heights, poses)
     ]
-    return World(world, run, settings.window), poses, turn, [int(t) + 1 for t in np.flatnonzero(overlap < OVERLAP)]
+    apart = [int(t) + 1 for t in np.flatnonzero(overlap < OVERLAP)]
+    return World(world, run, settings.window), poses, turn, apart, bool(ground_seen)
 
 
 def _may_be_sensor(points: np.ndarray, place: np.ndarray) -> bool:

@@ -16,15 +16,19 @@ _LEAST = 0.04  # share of the points in a plane worth a look
 _PIT = 0.7  # meters: a cell so far below those around it is a mirror
 _CELLS = 400  # along a side of the map, at most
 _PLANES = 4
-_TILT = np.cos(np.radians(35))  # a plane this near to an axis of the file may be the ground
+_AHEAD = 0.5  # length of the mean viewing direction above which a sensor looks ahead, not around
+_TILT = np.cos(np.radians(35))  # a plane this near to an axis of the file, or to that of the beams, may be the ground
+_LEANS = np.cos(np.radians(60))  # ground leans no more than this against the axis of the beams; walls stand along it
+_LEVEL = np.cos(np.radians(15))  # an axis of the file this near to that of the beams is upright by intention
+_ALL_AROUND = 0.6  # share of the second least spread of the beams' directions above which they turn about no axis
 
 
 def find_up(points: np.ndarray, sensor: np.ndarray | None, seed: int = 0) -> tuple[np.ndarray, bool]:
     """Returns the unit vector f64 (3) that points up, and whether a ground plane showed it.
 
     points: f64 (N,3), meters. Planes are found one after the other by RANSAC; the ground is a large one with hardly
-    anything below it, across which the sensor looks. Without any, up is the file's axis along which a scene extends
-    least.
+    anything below it, across which the sensor looks. Without any, up is the axis about which the beams of a spinning
+    sensor turn, or else the file's axis along which a scene extends least.
     """
     open3d = load_open3d()
     open3d.utility.random.seed(seed)
@@ -32,12 +36,15 @@ def find_up(points: np.ndarray, sensor: np.ndarray | None, seed: int = 0) -> tup
     thin = np.asarray(rest.points)
     extent = np.ptp(np.percentile(thin, (2, 98), axis=0), axis=0)
     best, up = 0.0, np.eye(3)[extent.argmin()] if len(points) > 2 else np.eye(3)[2]
-    sight = _viewing_direction(thin, sensor)
+    sight, axis = _viewing_direction(thin, sensor), _axis_of_beams(points, sensor)
+    if axis is not None:
+        nearest = np.eye(3)[np.abs(axis).argmax()]
+        up = nearest if nearest @ axis >= _LEVEL else axis
     for _ in range(_PLANES):
         if len(rest.points) < max(50, _LEAST * len(thin)):
             break
         plane, inside = rest.segment_plane(0.15, 3, 300)
-        score, normal = _judge_plane(np.array(plane), len(inside) / len(thin), thin, sight)
+        score, normal = _judge_plane(np.array(plane), len(inside) / len(thin), thin, sight, axis)
         flatness = np.abs(normal) @ (extent.max() / np.maximum(extent, 1.0))  # normals along the thin side of a scene
         if score * flatness > best:
             best, up = score * flatness, normal
@@ -53,15 +60,34 @@ def _viewing_direction(points: np.ndarray, sensor: np.ndarray | None) -> np.ndar
     return (way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)).mean(0)
 
 
-def _judge_plane(plane: np.ndarray, share: float, points: np.ndarray, sight: np.ndarray) -> tuple[float, np.ndarray]:
+def _axis_of_beams(points: np.ndarray, sensor: np.ndarray | None) -> np.ndarray | None:
+    """Returns the axis f64 (3) about which the beams turn that ended at points (N,3), its largest component positive.
+
+    None where the sensor is unknown, looks ahead, or looks into all directions alike. Beams rise and fall less than they
+    turn, however near a wall is.
+    """
+    if sensor is None or len(points) < 3 or np.linalg.norm(_viewing_direction(points, sensor)) > _AHEAD:
+        return None
+    way = points - sensor
+    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    spread, axes = np.linalg.eigh(way.T @ way)
+    axis = axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0])
+    return axis if spread[0] < _ALL_AROUND * spread[1] else None
+
+
+def _judge_plane(
+    plane: np.ndarray, share: float, points: np.ndarray, sight: np.ndarray, axis: np.ndarray | None
+) -> tuple[float, np.ndarray]:
     """Returns the share of points in a plane (4), 0 where it can't be ground, and its normal f64 (3) toward most points."""
     normal, offset = plane[:3] / np.linalg.norm(plane[:3]), plane[3] / np.linalg.norm(plane[:3])
     height = points @ normal + offset
     if (height > 0.15).sum() < (height < -0.15).sum():
         normal, height = -normal, -height
     below = (height < -0.6).mean()
-    facing = np.linalg.norm(sight) > 0.5 and abs(sight @ normal) > 0.75 * np.linalg.norm(sight)
-    possible = share >= _LEAST and below <= _BELOW and np.abs(normal).max() >= _TILT and not facing
+    facing = np.linalg.norm(sight) > _AHEAD and abs(sight @ normal) > 0.75 * np.linalg.norm(sight)
+    leans = 1.0 if axis is None else abs(normal @ axis)
+    near = leans >= _LEANS and max(np.abs(normal).max(), 0.0 if axis is None else leans) >= _TILT
+    possible = share >= _LEAST and below <= _BELOW and near and not facing
     return (share if possible else 0.0), normal
 
 

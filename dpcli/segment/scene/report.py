@@ -30,20 +30,31 @@ def scene_lines(reader: PartsReader) -> list[str]:
 
 
 def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> str:
-    """Returns how far a part (0: the sensor) moves over the ground in a frame, in the median, and per second."""
+    """Returns how far a part (0: the sensor) moves over the ground in a frame, in the median, and per second.
+
+    Frames that repeat the one before count as one with it, from the time of the first.
+    """
     steps, times = [], []
     for (i, j), motion in zip(said.pairs.tolist(), said.motion.astype(np.float64)):
         own = sequence.frame(i)[sequence.part[sequence.frame_offsets[i] : sequence.frame_offsets[i + 1]] == part]
-        if abs(i - j) == 1 and len(own):
+        if abs(i - j) == 1 and len(own) and not _same(sequence, i, j):
             middle = np.append(np.median(own, axis=0), 1.0).astype(np.float64)
             moved = np.linalg.solve(motion[0], motion[part] @ middle) if part else motion[0] @ middle
             steps.append(np.linalg.norm((moved - middle)[:3]))
-            times.append(np.nan if sequence.time is None else abs(sequence.time[j] - sequence.time[i]))
+            since = min(i, j)
+            while since > 0 and _same(sequence, since - 1, since):
+                since -= 1
+            times.append(np.nan if sequence.time is None else abs(sequence.time[max(i, j)] - sequence.time[since]))
     if not steps:
         return "unknown"
     step = f"{np.median(steps):.2f} {unit} a frame"
     rate = np.median(np.array(steps) / np.where(np.array(times) > 0, times, np.nan))
     return f"{step} ({rate:.1f} {unit}/s)" if np.isfinite(rate) else step
+
+
+def _same(sequence: CloudSequence, first: int, second: int) -> bool:
+    """Returns whether two frames have the same points in the same order."""
+    return np.array_equal(sequence.frame(first), sequence.frame(second))
 
 
 def picture_of_scene(sequence: CloudSequence, length_unit: str) -> tuple[CloudSequence, Look]:

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
-from dpcli.segment.scene.explain import explain_scene
+from dpcli.segment.scene.explain import SceneExplanation, explain_scene
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.tracking import moved
 from dpcli.segment.segmenters import Flows, Segmenter
@@ -20,6 +21,7 @@ from dpcli.store.parts import PartsSample
 from dpcli.store.schema import METERS
 
 _FARTHEST = 1e7  # meters, between points of a scene
+_USUAL = (0.3, 2000.0)  # meters from the middle, within which half of the points of a room or a street lie
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ class SceneSegmenter(Segmenter):
     ) -> tuple[np.ndarray, PartsSample]:
         """Returns the labels i16 (P) of a sequence, and masks, motions and flow of the pairs of frames, in its own unit.
 
-        Frames are looked at in the order of `time` where it is known; units that are no lengths count as meters. Raises
-        DataError for points farther apart than any two on Earth.
+        Frames are looked at in the order of `time` where it is known, one that repeats the one before only once; units that
+        are no lengths count as meters. Raises DataError for points farther apart than any two on Earth.
         """
         count, unit = sequence.num_frames, METERS.get(length_unit, 1.0)
         order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
@@ -59,9 +61,10 @@ class SceneSegmenter(Segmenter):
                 f" the right --unit (the file's is {length_unit or 'unknown'})"
             )
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
-        found = explain_scene([clouds[t] for t in order], list(moved(origins, to_meters)), self.settings)
-        place = np.argsort(order)
-        self._tell(sequence.name, [int(order[t]) for t in found.apart], found.dropped)
+        seen, place = _without_repeats(clouds, order)
+        found = explain_scene([clouds[t] for t in seen], list(moved(origins, to_meters)), self.settings)
+        _tell_size(sequence.name, clouds, length_unit)
+        self._tell(sequence.name, [seen[t] for t in found.apart], found, count - len(seen))
         label = np.concatenate([found.labels[place[t]] for t in range(count)])
         motions, flows = np.tile(np.eye(4), (len(pairs), self.slots, 1, 1)), []
         for own, (i, j) in zip(motions, pairs):
@@ -76,18 +79,54 @@ class SceneSegmenter(Segmenter):
         sample = PartsSample(sure[label], np.array(pairs, np.int32).reshape(-1, 2), np.float32(motions), flows)
         return label.astype(np.int16), sample
 
-    def _tell(self, name: str, apart: list[int], dropped: int) -> None:
-        """Warns of frames whose place is unknown, since they overlap with none before them, and of objects left out."""
-        if dropped:
+    def _tell(self, name: str, apart: list[int], found: SceneExplanation, repeats: int) -> None:
+        """Warns of what was assumed: of frames whose place is unknown, since they overlap with none before them, of objects
+        left out, of an unknown sensor or ground, and of frames that repeat others.
+        """
+        if found.dropped:
             log.warn(
-                f"{name}: {dropped} moving objects besides the largest {self.settings.most_objects} are assumed to stand still;"
-                " --set most_objects= keeps more"
+                f"{name}: {found.dropped} moving objects besides the largest {self.settings.most_objects} are assumed to stand"
+                " still; --set most_objects= keeps more"
             )
         if apart:
             log.warn(
                 f"{name}: frame {', '.join(map(str, apart))}: too little in common with the frame before to tell how the"
                 " sensor moved; its motion is assumed to continue, and nothing is compared across the gap"
             )
+        if not found.sensor_known:
+            log.warn(
+                f"{name}: the ranges don't fit a sensor at the origin, before or after shift, so what it saw through is"
+                " unknown; expect false alarms, or give each frame in the sensor's own coordinates"
+            )
+        if not found.ground_seen:
+            log.warn(
+                f"{name}: no ground plane was found, so which way is up is a guess; where the ground was removed,"
+                " give --set ground=0.02, else turn the clouds so that an axis points up"
+            )
+        if repeats:
+            log.warn(f"{name}: {counted(repeats, 'frame')} looked at once with the one before: the points are the same")
+
+
+def _without_repeats(clouds: list[np.ndarray], order: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Returns the frames in their order without those that repeat the one before, and the place i64 (T) there of each."""
+    seen: list[int] = []
+    place = np.zeros(len(clouds), np.int64)
+    for t in order.tolist():
+        if not seen or len(clouds[t]) == 0 or not np.array_equal(clouds[t], clouds[seen[-1]]):
+            seen.append(t)
+        place[t] = len(seen) - 1
+    return seen, place
+
+
+def _tell_size(name: str, clouds: list[np.ndarray], length_unit: str) -> None:
+    """Warns where clouds f64 (N_t,3), in meters, are too small or large for a scene, as they are in a wrong unit."""
+    radii = [float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1))) for own in clouds if len(own)]
+    radius = float(np.median(radii)) if radii else 0.0
+    if 0 < radius and not _USUAL[0] <= radius <= _USUAL[1]:
+        log.warn(
+            f"{name}: half of a frame's points lie within {radius:.2g} m, expected a street or a room; if that is wrong,"
+            f" convert the data again with the right --unit (the file's is {length_unit or 'unknown'})"
+        )
 
 
 def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) -> np.ndarray:

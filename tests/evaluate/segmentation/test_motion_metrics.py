@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -171,6 +172,32 @@ def test_protocols_and_thresholds(tmp_path, truths) -> None:
     assert [row["tau"] for row in both] == [0.01, 0.05] and both[1]["accs"] == 1 > both[0]["accs"]
     assert dpc_["metrics"]["epe3d"] == pytest.approx(0.02, abs=1e-6)
     assert [row["name"] for row in dpc_["metrics"]["per_class"]] == ["door", "lamp"]
+
+
+@pytest.mark.parametrize(("unit", "meters"), [("mm", 1e-3), ("ft", 0.3048), ("object diameter", 1.0)])
+def test_thresholds_are_meters_in_every_known_unit(unit, meters, tmp_path, truths) -> None:
+    """Errors of 0.012, 0.07 or 0.4 m: the same points count whatever unit the files are in."""
+
+    def measured(place, scale, length_unit):
+        samples = []
+        for one, error in zip(truths, (0.012, 0.07, 0.4), strict=True):
+            sequence, probability, pairs, motion, flows = perfect(one, 4)
+            motion, flows = motion.copy(), [(flow + np.float32([error, 0, 0])) * np.float32(scale) for flow in flows]
+            motion[..., :3, 3] *= scale
+            sequence.points = one.points * np.float32(scale)
+            samples.append((sequence, probability, pairs, motion, flows))
+        scaled = [replace(one, points=one.points * np.float32(scale), pose=one.pose.copy()) for one in truths]
+        for one in scaled:
+            one.pose[..., :3, 3] *= scale
+        parts = write_parts(tmp_path / f"{place}-p.h5", samples, length_unit=length_unit)
+        truth = write_truth(tmp_path / f"{place}-t.h5", scaled, length_unit=length_unit)
+        return json.loads(run(parts, "--truth", truth, "--json").stdout)
+
+    meter, other = measured("m", 1.0, "m"), measured("other", 1 / meters, unit)
+    assert meter["metrics"]["thresholds"] == other["metrics"]["thresholds"]
+    assert 0.2 < meter["metrics"]["accs"] < meter["metrics"]["accr"] < 1
+    assert other["metrics"]["epe3d"] * meters == pytest.approx(meter["metrics"]["epe3d"], rel=1e-5)
+    assert (other["units"]["epe3d"], other["units"]["tau"]) == (unit, "m" if unit in ("mm", "ft") else unit)
 
 
 def test_table_says_of_what(tmp_path, truths) -> None:

@@ -174,6 +174,12 @@ def test_what_is_known_of_a_sequence_stays(data, tmp_path):
         np.testing.assert_array_equal(some.read(0).scene_flow, flow.read(3).scene_flow)
 
 
+def test_flow_as_points_has_no_place_on_a_map():
+    sequence = replace(moving("s", 0), shift=np.array([4.5e5, 5.4e6, 120.0]))
+    assert FlowOfSequence("nearest", 20)((0, sequence)).shift is not None
+    assert FlowOfSequence("nearest", 20, as_points=True)((0, sequence)).shift is None
+
+
 def test_a_stopped_run_is_continued_to_the_same_bytes(data, tmp_path, monkeypatch):
     estimate(data, tmp_path / "whole.h5")
     done, calls = module.sequence_flow, []

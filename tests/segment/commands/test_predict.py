@@ -44,6 +44,27 @@ def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path,
         assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
 
 
+@pytest.mark.parametrize(
+    ("parts", "sizes", "found"), [(40, [20] * 40, 40), (3, [400, 390, 10], 2), (20, [60] * 20, 20)]
+)
+@pytest.mark.parametrize("method", ["ward", "trajaffn", "ssc"])
+def test_as_many_parts_are_found_as_are_asked_for_or_a_warning_says_so(method, parts, sizes, found, dpc_here, tmp_path):
+    rng = np.random.default_rng(5)
+    place, step = rng.uniform(-1, 1, (parts, 3)), rng.normal(0, 0.08, (parts, 3))
+    own = np.repeat(np.arange(parts), sizes)
+    shape = rng.normal(0, 0.01, (len(own), 3))
+    clouds = [np.float32(place[own] + t * step[own] + shape) for t in range(2)]
+    with CloudsWriter(tmp_path / "c.h5", fields=[]) as writer:
+        writer.write(CloudSequence.from_frames("many", clouds))
+    words = ("--method", method, "--parts", parts, "--flow", "nearest" if method == "ward" else "icp")
+    done = dpc_here("segment", "predict", tmp_path / "c.h5", "-o", tmp_path / "p.h5", *words)
+    assert done.returncode == 0, done.stderr
+    with PartsReader(tmp_path / "p.h5") as reader:
+        count = len(np.unique(reader.read(0).part))
+    assert (f"fewer than the {parts} parts of --parts" in done.stderr.decode()) == (count < parts)
+    assert method != "ward" or count == found
+
+
 def test_no_name_in_a_file_leads_out_of_the_folder_of_ply_files(dpc_here, tmp_path):
     """Nor do two names share a folder."""
     names, cloud = ["..", "a/b", "a_b"], np.random.default_rng(0).random((20, 3), np.float32)

@@ -145,6 +145,16 @@ def test_a_wrong_choice_is_named_before_anything_is_made(words, said, dpc_here, 
     assert not (tmp_path / "model").exists()
 
 
+@pytest.mark.parametrize("words", [("train",), ("flow",)])
+def test_several_processes_of_torchrun_are_refused_before_one_overwrites_the_other(
+    words, dpc_here, data, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    done = dpc_here("segment", *words, data, "-o", tmp_path / "model")
+    assert done.returncode == 2 and b"trains in one process, but torchrun started 2" in done.stderr
+    assert not (tmp_path / "model").exists()
+
+
 def test_a_run_that_diverges_is_told(dpc_here, data, tmp_path):
     done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, "--set", "lr=1e12")
     said = done.stderr.decode()

@@ -17,7 +17,7 @@ from dpcli.segment.scene.clusters import cluster
 from dpcli.segment.scene.ego_motion import register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import LineOfSight, range_jumps
-from dpcli.segment.scene.report import picture_of_scene
+from dpcli.segment.scene.report import _speed, picture_of_scene
 from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.store import CloudSequence, CloudsWriter
@@ -174,6 +174,44 @@ def test_frames_that_show_no_common_place_are_named(capsys):
     assert "changed: frame 1, 3: too little in common" in capsys.readouterr().err
 
 
+def test_frames_that_repeat_the_one_before_are_looked_at_once(capsys):
+    truth, (labels, said) = street(), answer()
+    twice = [frame for frame in frames_of(truth) for _ in range(2)]
+    sequence = changed(twice, time=np.arange(6) / 20)
+    again, more = explained(sequence, [(t, t + 1) for t in range(5)])
+    assert "changed: 3 frames looked at once" in capsys.readouterr().err
+    for t, own in enumerate(again):
+        np.testing.assert_array_equal(own, labels[t // 2])
+    assert max(np.abs(flow).max() for flow in more.flow[::2]) < 1e-6
+    for flow, once in zip(more.flow[1::2], said.flow):
+        np.testing.assert_allclose(flow, once, atol=1e-6)
+    sequence.part = np.concatenate(again)
+    assert _speed(sequence, more, 0, "m") == _speed(with_part(truth, labels), said, 0, "m")
+
+
+def with_part(sequence, labels):
+    sequence = copy.copy(sequence)
+    sequence.part = np.concatenate(labels)
+    return sequence
+
+
+@pytest.mark.parametrize(
+    ("change", "unit", "warned"),
+    [
+        (lambda f: f + [900, 400, 30], "m", "don't fit a sensor at the origin"),
+        (lambda f: f, "mm", "lie within 0.0"),
+        (lambda f: 1000 * f, "m", "expected a street or a room"),
+        (lambda f: wall(np.random.default_rng(len(f)), 0), "m", "no ground plane was found"),
+    ],
+)
+def test_what_had_to_be_guessed_is_told(change, unit, warned, capsys):
+    explained(changed([change(frame[::9]) for frame in frames_of(street())]), unit=unit)
+    assert warned in capsys.readouterr().err
+    answer.cache_clear()
+    answer()
+    assert not capsys.readouterr().err  # nothing had to be guessed in the street itself
+
+
 def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
     labels, said = explained(street(), most_objects=1)
     assert "street: 1 moving objects besides the largest 1" in capsys.readouterr().err
@@ -222,6 +260,21 @@ def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
     pole = np.stack([np.full(30, 5.0), np.full(30, 5.0), 0.5 + np.linspace(0.3, 3, 30)], 1)
     height = height_above_ground(np.concatenate([hill, pole]))
     assert np.percentile(height[:20000], 99) < 0.2 and (height[20000:] > 0.2).all()
+
+
+@pytest.mark.parametrize("turn", [0, 20, 45, 70])
+def test_up_is_along_the_axis_of_the_beams_whatever_walls_stand_beside(turn):
+    frame = street().frame(0).astype(np.float64)
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    yaw, pitch = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    up, seen = find_up(frame @ (pitch @ yaw).T, np.zeros(3))
+    assert seen and up @ pitch[:, 2] > 0.99
+    bare = frame[height_above_ground(frame) > 0.3] @ yaw.T  # as of data sets whose ground was removed
+    assert find_up(bare, np.zeros(3))[0][2] > 0.99
+    turns, rises = np.meshgrid(np.linspace(0, 2 * np.pi, 900), np.radians(np.linspace(-22, 2, 32)))
+    beams = np.stack([np.cos(turns) * np.cos(rises), np.sin(turns) * np.cos(rises), np.sin(rises)], -1).reshape(-1, 3)
+    between_buses = beams / np.abs(beams / [12, 1.2, 1.4]).max(1, keepdims=True)
+    assert find_up(between_buses @ yaw.T, np.zeros(3))[0][2] > 0.99
 
 
 def test_the_sensors_motion_is_found_from_far_off_starts():
