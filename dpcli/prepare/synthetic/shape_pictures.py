@@ -155,7 +155,9 @@ def _models_in(place: Path) -> list[Path]:
         return [place]
     if not place.is_dir():
         raise DataError(f"{place}: {why_unreadable(place) or 'no such file or folder'}")
-    found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
+    found = sorted(
+        path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf") and not path.name.startswith(".")
+    )
     if not found:
         raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")
     return found
