@@ -63,8 +63,8 @@ def fit_scene(
     chosen, folder_path = choose_device(device), _run_folder(output, run)
     with input_file(views) as path:
         record = _record(path, config, supervision, seed)
-        made = output != "-" and not force
-        if made and already_made(Path(output), {"config": record}, scene_origin, ["config"]):
+        entry, made = provenance.record(record, seed, {"views": path}), output != "-" and not force
+        if made and already_made(Path(output), entry, scene_origin, ["config"]):
             if picture is not None:
                 write_preview(read_scene(Path(output)), _load(path, config, supervision), picture)
             return
@@ -77,7 +77,7 @@ def fit_scene(
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
         scene = to_scene(model, targets, metrics, calm=shape is not None)
-        _write(output, scene, targets, provenance.record(record, seed, {"views": path}), seed, force)
+        _write(output, scene, targets, entry, seed, force)
         if picture is not None:
             write_preview(scene, targets, picture)  # its parts are those of the file
     log.info(
