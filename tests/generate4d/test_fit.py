@@ -17,6 +17,9 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.commands import fit
 from dpcli.generate4d.config import FitConfig, Supervision
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.model_file import save_shape_model
+from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import read_scene, scene_origin
@@ -273,6 +276,20 @@ def test_the_settings_of_a_run_make_the_same_run_again(tmp_path, dpc_here):
         "generate4d", "fit", views, "-o", tmp_path / "c.h5", "--run", tmp_path / "a.fit", *words, "--parts", 2
     )
     assert other.returncode == 2 and b"config.parts 3, now 2" in other.stderr
+
+
+def test_a_prior_that_was_trained_again_makes_another_fit(tmp_path, dpc_here):
+    """The scene of the weights before doesn't count as that of the weights that are there now, under the same name."""
+    weights = tmp_path / "weights.safetensors"
+    words = ("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
+    words = (*words, "--size", 16, *steps(1, 1), "--prior", "network", "--prior-model", weights)
+    model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=5))
+    made = b"made with other prior weights; write to"  # and nothing else: seed, version and clip are the same
+    for offset, code, said in ((1.0, 0, b"fitting"), (1.0, 0, b"already complete"), (2.0, 2, made)):
+        save_shape_model(weights, model, {"size": 16, "confidence": [0.0, offset]})
+        done = dpc_here(*words)
+        assert done.returncode == code and said in b" ".join(done.stderr.split()), done.stderr
+    assert b"is not read with --prior inflated" in dpc_here(*words, "--prior", "inflated", "--force").stderr
 
 
 def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):

@@ -133,7 +133,17 @@ def test_pictures_of_a_clip_have_their_times(tmp_path, capfd):
     assert "its frames have the times in times.txt" in said and "assumed" not in said
     with ViewsReader(tmp_path / "v.h5") as reader:
         np.testing.assert_allclose(reader.header.time, SECONDS, atol=1e-5)
+    (tmp_path / "times.txt").write_text("\n".join(FORMS["dates"](2 * SECONDS)))  # other times make another file
+    assert exit_code("prepare", "video", tmp_path, "-o", tmp_path / "v.h5", "--size", 32) == 2
+    assert "made with other times; write to" in " ".join(capfd.readouterr().err.split())
     (tmp_path / "times.txt").write_text("0\n0.1\n")
     assert exit_code("prepare", "video", tmp_path, "-o", tmp_path / "w.h5", "--size", 32) == 0
     said = capfd.readouterr().err
     assert "left out: times.txt (2 times for 6 frames)" in said and "16 per second assumed" in said
+    for t, at in enumerate(1.3e9 + SECONDS):  # TUM and ROS name pictures so
+        (tmp_path / f"{t}.png").rename(tmp_path / f"{at:.6f}.png")
+    assert exit_code("prepare", "video", tmp_path, "-o", tmp_path / "x.h5", "--size", 32) == 0
+    said = capfd.readouterr().err
+    assert "its frames have the times in their names" in said and "missing" not in said and "assumed" not in said
+    with ViewsReader(tmp_path / "x.h5") as reader:
+        np.testing.assert_allclose(reader.header.time, SECONDS, atol=1e-5)

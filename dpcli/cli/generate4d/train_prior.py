@@ -40,12 +40,15 @@ def train_prior(
     settings = ShapeTraining(**CATALOG.resolve(PRESETS[str(given.preset)], given))
     from dpcli.generate4d.commands.train_prior import check_sizes, train_shape_prior
     from dpcli.prepare.synthetic.shape_pictures import find_meshes, picture_sources
+    from dpcli.prepare.views.views_pipeline import digest_of
 
     check_sizes(settings)
     learned, held = find_meshes(meshes or [], settings.data.held_out)
     shares = {key: getattr(settings.data, key) for key in ("made", "moving", "views", "warp")}
     sources = picture_sources(learned, held, settings.schedule.size, seed, **shares)
     models = {"models": len(learned), "held_out": sorted(file.path.name for file in held)}
+    if learned or held:
+        models["models_digest"] = digest_of(file.path for file in [*learned, *held])
     best = train_shape_prior(
         output, settings, sources[0].make, sources[1].make, models, seed=seed, jobs=jobs, force=force, device=device
     )

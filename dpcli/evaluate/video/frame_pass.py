@@ -138,6 +138,16 @@ class FramePass:
         odd = [k for k, (a, b) in enumerate(zip(own, other)) if a - first[0] != b - first[1]]
         return f"{own[odd[0]]} with {other[odd[0]]}" if odd else ""
 
+    def _timed_otherwise(self) -> str:
+        """Returns, in words, the first frames that lie more than half a frame apart in time, counted from the first frame of
+        each side; "" without such. Both sides have a rate, nearly the same.
+        """
+        own, other = (np.asarray(s.times) - s.times[0] for s in (self.predicted, self.truth))
+        count = min(len(own), len(other))
+        apart = own[:count] * self.predicted.rate - other[:count] * self.truth.rate  # frames: rates may differ a little
+        odd = np.flatnonzero(np.abs(apart) > 0.5)
+        return f"frame {odd[0]}: after {own[odd[0]]:.4g} s and {other[odd[0]]:.4g} s" if len(odd) else ""
+
     def _frame_jobs(
         self, ours: int, theirs: int, count: int, damaged: list[str]
     ) -> Iterator[Callable[[], PictureStatistics]]:
@@ -216,6 +226,10 @@ class FramePass:
         if all(rates) and abs(rates[0] / rates[1] - 1) > _RATE:
             lines.append(
                 f"The prediction plays {rates[0]:.4g} frames a second, the truth {rates[1]:.4g}: compared by their number."
+            )
+        elif all(rates) and (odd := self._timed_otherwise()):
+            lines.append(
+                f"Frames are compared in their order, though they were filmed at other moments ({odd}): does one side lack some?"
             )
         if self.misnumbered:
             lines.append(

@@ -23,6 +23,7 @@ from dpcli.generate4d.out.scene_writer import to_scene
 from dpcli.generate4d.priors.interface import Prior
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.shape.choice import guide
+from dpcli.generate4d.shape.model_file import find_shape_model
 from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
 from dpcli.ops.splatting.rasterization import gsplat_available
@@ -62,8 +63,8 @@ def fit_scene(
     chosen, folder_path = choose_device(device), _run_folder(output, run)
     with input_file(views) as path:
         record = _record(path, config, supervision, seed)
-        made = output != "-" and not force
-        if made and already_made(Path(output), {"config": record}, scene_origin, ["config"]):
+        entry, made = provenance.record(record, seed, {"views": path}), output != "-" and not force
+        if made and already_made(Path(output), entry, scene_origin, ["config"]):
             if picture is not None:
                 write_preview(read_scene(Path(output)), _load(path, config, supervision), picture)
             return
@@ -76,7 +77,7 @@ def fit_scene(
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
         scene = to_scene(model, targets, metrics, calm=shape is not None)
-        _write(output, scene, targets, provenance.record(record, seed, {"views": path}), seed, force)
+        _write(output, scene, targets, entry, seed, force)
         if picture is not None:
             write_preview(scene, targets, picture)  # its parts are those of the file
     log.info(
@@ -90,9 +91,12 @@ def _groups(config: FitConfig, supervision: Supervision) -> dict[str, Any]:
 
 
 def _record(views: Path, config: FitConfig, supervision: Supervision, seed: int) -> dict[str, Any]:
-    """Returns what makes a fit this one and no other: its settings, seed and input."""
+    """Returns what makes a fit this one and no other: its settings, seed, input, and the weights that a user named."""
     settings = {"config": asdict(config), **asdict(supervision)}
-    return {**json.loads(json.dumps(settings)), "seed": seed, "data": provenance.file_digest(views)}
+    record = {**json.loads(json.dumps(settings)), "seed": seed, "data": provenance.file_digest(views)}
+    if supervision.prior in ("auto", "network") and supervision.prior_model is not None:
+        record["prior_weights"] = provenance.file_digest(find_shape_model(supervision.prior_model))
+    return record
 
 
 def _load(path: Path, config: FitConfig, supervision: Supervision) -> Targets:

@@ -28,6 +28,7 @@ from dpcli.store.gaussians import read_scene, scene_origin
 from dpcli.store.views import ViewsHeader
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
+_CAMERA = ("azimuth", "elevation", "radius", "fovy")
 _SHEET_SIDE = 160  # pixels of its pictures
 
 
@@ -63,7 +64,7 @@ def render_scene(
         scene.require_times(header.time, scene_file, f"{cameras} has frames from {span}")
         _render_views(renderer, look, header, str(output), [*history, entry], root, force)
     elif output is not None:
-        _render_path(renderer, look, Path(output), settings, force)
+        _render_path(renderer, look, Path(output), settings, force, has_sheet=picture is not None)
     if picture is not None:
         _render_sheet(renderer, look, picture, settings)
 
@@ -80,7 +81,7 @@ def _check_views(output: str | None, settings: RenderSettings, look: Look, *, ha
         raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
     unused = settings.changed("path", "frames", "fps")
     if not has_sheet:  # which has use for these
-        unused += settings.changed("azimuth", "elevation", "radius", "fovy", "size", "time")
+        unused += settings.changed(*_CAMERA, "size", "time")
         unused += ["background"] if look.background not in (None, LIGHT.background) else []
     if unused:
         raise UsageError(
@@ -89,13 +90,19 @@ def _check_views(output: str | None, settings: RenderSettings, look: Look, *, ha
         )
 
 
-def _render_path(renderer: Renderer, look: Look, output: Path, settings: RenderSettings, force: bool) -> None:
+def _render_path(
+    renderer: Renderer, look: Look, output: Path, settings: RenderSettings, force: bool, *, has_sheet: bool
+) -> None:
     kind, path = output_kind(output), settings.path
     if look.background is None and kind in (".mp4", ".gif"):
         raise UsageError(f"-o {output}: {kind} has no transparency; use a .png or a folder, or another --background")
     if kind == ".png" and (unused := settings.changed("frames", "fps")):
         raise UsageError(
             f"{', '.join(unused)}: -o {output} is one picture; name a .mp4, a .gif or a folder, or leave it out"
+        )
+    if path == "reference" and not has_sheet and (unused := settings.changed(*_CAMERA)):  # a sheet has use for them
+        raise UsageError(
+            f"{', '.join(unused)}: --path reference is the input's own camera; take --path fixed, or leave it out"
         )
     times = {"frames": settings.frames, "fps": settings.fps, "time": settings.time}
     shots = plan_shots(renderer.scene, path, _lens(settings), **times)

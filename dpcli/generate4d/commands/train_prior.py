@@ -12,7 +12,7 @@ import torch
 
 from dpcli.counted import counted
 from dpcli.errors import UsageError
-from dpcli.generate4d.shape.model_file import load_shape_model
+from dpcli.generate4d.shape.model_file import find_shape_model, load_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.training.learning_curves import COLUMNS, draw_curves
 from dpcli.generate4d.shape.training.rounds import MakeModels, draw_round
@@ -43,13 +43,15 @@ def train_shape_prior(
 ) -> Path:
     """Trains on the pictures that `learned` makes and returns the file of the best weights, by the pictures of `held`.
 
-    models: what the pictures come from; a run continues only with the same. Raises UsageError where the settings don't
-    fit each other or the folder holds another run.
+    models: what the pictures come from; a run continues only with the same, and with the same weights to start from.
+    Raises UsageError where the settings don't fit each other or the folder holds another run.
     """
     check_sizes(settings)
     where = choose_device(device)
     record = {name: asdict(group) for name, group in settings._asdict().items()}
     record = json.loads(json.dumps({**record, "seed": seed, **models}))
+    if settings.data.init is not None:
+        record["init_weights"] = provenance.file_digest(find_shape_model(settings.data.init))
     folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)
     torch.manual_seed(torch_seed(seed, Generate4DStream.SHAPE_WEIGHTS))
     model = _start(settings, folder)

@@ -21,6 +21,8 @@ def guide(prior: Prior, targets: Targets, model: str | None = None) -> ShapeGuid
     `auto` takes the network where it is there and its confidence is at least LEAST_CONFIDENCE, else the inflated
     silhouette, and says so. model: other weights than the shipped. Raises UsageError for weights that aren't there.
     """
+    if model is not None and prior in ("none", "inflated", "views"):
+        log.warn(f"--prior-model {model}: is not read with --prior {prior}; give --prior network")
     if prior not in ("auto", "inflated", "network"):
         return None
     network = _network(prior, model) if prior != "inflated" else None

@@ -58,7 +58,7 @@ FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampl
 class Frames:
     """Holds the frames of a clip. `names` are for messages; `numbers` the integers in the names (or 0, 1, ...).
 
-    times: f64 (T) seconds as the file declares them, None when it doesn't.
+    times: f64 (T) seconds as the file, the names or a text beside them tell, None when nothing does.
     """
 
     path: Path
@@ -178,12 +178,12 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
         numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3
     names = tuple(path.name for path in paths)
     timed = with_times(Series(folder, names, pattern), folder)
-    beside = timed.beside
-    if beside and not quiet:
-        log.info(f"{folder}: its frames have the times in {beside.path.name}")
+    seconds = timed.times()
+    if seconds is not None and not quiet:
+        log.info(f"{folder}: its frames have the times in {timed.beside.path.name if timed.beside else 'their names'}")
     for unfit in () if quiet else timed.left_out:
         log.info(f"{folder}: left out: {unfit}")
-    return Frames(folder, names, tuple(numbers), tuple(paths), tuple(beside.seconds.tolist()) if beside else None)
+    return Frames(folder, names, tuple(numbers), tuple(paths), None if seconds is None else tuple(seconds.tolist()))
 
 
 def _held_instead(folder: Path) -> str:

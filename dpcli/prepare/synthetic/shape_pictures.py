@@ -121,10 +121,16 @@ def picture_sources(
     views: int = 6,
     warp: float = 0.0,
 ) -> tuple[PictureSource, PictureSource]:
-    """Returns the source to learn from and the one to validate on: held-out models alone, what is made up without any."""
+    """Returns the source to learn from and the one to validate on: held-out models alone, moving and still ones in the shares
+    of their numbers; what is made up without any.
+    """
+    if held and not learned and made < 1:
+        log.warn(f"all {len(held)} models are held out: what is made up is learned alone")
     return (
         PictureSource(tuple(learned), size, seed, made, moving, views, warp),
-        PictureSource(tuple(held), size, seed, made=0.0, moving=1.0),
+        PictureSource(
+            tuple(held), size, seed, made=0.0, moving=sum(bool(file.clips) for file in held) / max(len(held), 1)
+        ),
     )
 
 
@@ -155,7 +161,9 @@ def _models_in(place: Path) -> list[Path]:
         return [place]
     if not place.is_dir():
         raise DataError(f"{place}: {why_unreadable(place) or 'no such file or folder'}")
-    found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
+    found = sorted(
+        path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf") and not path.name.startswith(".")
+    )
     if not found:
         raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")
     return found

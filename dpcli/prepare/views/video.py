@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -129,7 +130,10 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
     if not options.pattern:
         del config["pattern"]
-    config["input_digest"] = digest_of(open_frames(path, options.pattern, quiet=True).files)
+    frames = open_frames(path, options.pattern, quiet=True)
+    config["input_digest"] = digest_of(frames.files)
+    if path.is_dir() and frames.times is not None and options.fps is None:  # those of a video are in its bytes
+        config["times_digest"] = hashlib.sha256(np.array(frames.times).tobytes()).hexdigest()[:16]
     if options.mask:
         masks = require_folder(options.mask, "a mask per frame") if not options.mask.is_file() else None
         config["mask_digest"] = digest_of(image_paths(masks) if masks else [options.mask])
@@ -270,7 +274,9 @@ def _require_one_size(frames: Frames, wanted: list[int], sizes: list[tuple[int, 
 
 
 def warn_gaps(frames: Frames, wanted: list[int]) -> None:
-    """Says in the log where the numbers of frames jump."""
+    """Says in the log where the numbers of frames jump, unless their times are known, which show it."""
+    if frames.times is not None:
+        return
     steps = np.diff(frames.numbers)
     if len(steps) > 1 and (steps != np.median(steps)).any():
         at = int(np.argmax(steps != np.median(steps)))

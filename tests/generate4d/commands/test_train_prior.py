@@ -6,6 +6,7 @@ import contextlib
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,9 +19,11 @@ import pytest
 from safetensors.torch import load_file
 
 from dpcli.generate4d.commands.train_prior import train_shape_prior
+from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
 from dpcli.generate4d.shape.training.settings import PRESETS, ShapeTraining
 from dpcli.prepare.synthetic.shape_pictures import picture_sources
 from tests.support.commands import exit_code
+from tests.support.gltf_files import arm, quad
 from tests.support.pretend_card import pretend_card
 
 # two rounds of pictures, as many steps of each; every step ends with a row, a state and curves
@@ -77,6 +80,23 @@ def test_it_goes_on_from_weights_of_the_same_sizes_only(trained, tmp_path, capsy
     wide = ("--set", "widths=8,24")
     assert exit_code("generate4d", "train-prior", "-o", tmp_path / "wide", *WORDS, *more, *wide) == 2
     assert "another configuration" in capsys.readouterr().err
+
+
+def test_a_run_goes_on_with_the_models_and_weights_it_began_with_only(trained, tmp_path, capsys):
+    """Other contents under the same names are another training: nothing of the first one counts as this one's result."""
+    models, weights = tmp_path / "models", tmp_path / "init.safetensors"
+    models.mkdir()
+    quad(1.0).write(models / "a.glb")
+    (models / "._a.glb").write_bytes(b"what macOS writes beside a file")
+    shutil.copy(trained / "best.safetensors", weights)
+    words = ("generate4d", "train-prior", models, "--init", weights, *WORDS, "--steps", 1, "--set", "made=0.5")
+    assert exit_code(*words, "-o", tmp_path / "run") == 0
+    assert exit_code(*words, "-o", tmp_path / "run") == 0 and "finished already" in capsys.readouterr().err
+    arm().write(models / "a.glb")
+    assert exit_code(*words, "-o", tmp_path / "run") == 2 and "other models" in capsys.readouterr().err
+    quad(1.0).write(models / "a.glb")
+    save_shape_model(weights, load_shape_model(trained)[0], {"size": 16, "confidence": [0.5, 0.5]})
+    assert exit_code(*words, "-o", tmp_path / "run") == 2 and "other init weights" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

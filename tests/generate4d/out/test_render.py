@@ -282,6 +282,10 @@ def test_the_command_draws_and_refuses(scene, tmp_path):
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (4 + 4 * (32 + 22), 4 + 3 * (32 + 4))
     for more, says in (
         ([str(tmp_path / "b.mp4"), "--background", "none"], "has no transparency"),
+        (
+            [str(tmp_path / "b.mp4"), "--path", "reference", "--azimuth", "30"],
+            "azimuth: --path reference is the input's own",
+        ),
         ([str(tmp_path / "b.mp4"), "--cameras", str(tmp_path / "s.h5")], "-o FILE.h5"),
         ([str(tmp_path / "a.mp4")], "--force"),
     ):

@@ -13,8 +13,11 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.generate4d.viewer import write_page
 from dpcli.generate4d.viewer.input_sheet import input_sheet
+from dpcli.runtime.provenance import file_digest
+from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 from tests.support.browser import needs_browser, open_page
+from tests.support.commands import exit_code
 from tests.support.scenes import toy_scene
 
 _FLAGS = "--use-angle=swiftshader --enable-unsafe-swiftshader --virtual-time-budget=8000 --window-size=640,480".split()
@@ -196,3 +199,17 @@ def test_a_lost_context_is_said_and_rebuilt(page, tmp_path):
 def test_a_clip_of_another_length_is_refused(clip):
     with pytest.raises(DataError, match="5 frames, but the scene has 3"):
         input_sheet(clip, toy_scene(per_part=5, frames=3))
+
+
+def test_pictures_of_another_clip_are_told(clip, tmp_path, capsys):
+    """Two clips of as many frames: the scene's provenance knows which of them was fitted."""
+    scene, made = toy_scene(per_part=5, frames=5), {"inputs": {"views": file_digest(clip)}}
+    for name, entry, told in (
+        ("own", made, False),
+        ("other", {"inputs": {"views": "0" * 64}}, True),
+        ("edited", {}, False),
+    ):
+        write_scene(tmp_path / f"{name}.h5", scene, provenance=[entry])
+        words = (tmp_path / f"{name}.h5", "-o", tmp_path / f"{name}.html", "--input", clip)
+        assert exit_code("generate4d", "view", *words) == 0
+        assert ("another file than the one that was fitted" in " ".join(capsys.readouterr().err.split())) == told

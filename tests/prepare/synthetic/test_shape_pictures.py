@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 import torch
 
 from dpcli.errors import DataError
+from dpcli.prepare.synthetic import shape_pictures
 from dpcli.prepare.synthetic.creature_mesh import make_skin
 from dpcli.prepare.synthetic.shape_pictures import PictureSource, find_meshes, made_creature, picture_sources
 from dpcli.prepare.synthetic.wild_creature import wild_creature
@@ -80,6 +83,18 @@ def test_learned_and_held_out_pictures_come_from_their_own_models(models):
     assert {file.path.name for file in learn.files} == {"arm.glb", "still.glb"}
     assert {file.path.name for file in check.files} == {"square.glb"}
     assert len(learn.make(0, 8).draw().rgba) == 8 and len(check.make(0, 8).draw().rgba) == 8
+
+
+def test_all_held_out_models_validate_whether_they_move_or_not(models, monkeypatch, capsys):
+    """A still model that is held out beside a moving one is neither learned from nor left out of the validation."""
+    (models / "held.txt").write_text("arm.glb\nsquare.glb\nstill.glb\n")
+    seen = Counter()
+    read = shape_pictures._read
+    monkeypatch.setattr(shape_pictures, "_read", lambda file, rng: seen.update([file.path.name]) or read(file, rng))
+    _, check = picture_sources(*find_meshes([models], str(models / "held.txt")), 16, 0, made=0.5, moving=0.35)
+    assert "all 3 models are held out: what is made up is learned alone" in capsys.readouterr().err
+    check.make(0, 60 * check.views)
+    assert seen.keys() == {"arm.glb", "square.glb", "still.glb"} and 10 <= seen["still.glb"] <= 30
 
 
 def test_mistakes_are_said(models):

@@ -12,7 +12,7 @@ from unicodedata import normalize
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources.source import Picture, Source, View, mean_rate
+from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
@@ -171,7 +171,7 @@ class VideoSource(Source):
         else:
             look = look_at_video(path)
             count, times, self.has_alpha = look.count, look.times, look.has_alpha
-        self.rate = mean_rate(times)
+        self.times = times
         self.views, self.frames = [_view_of_folder("")], [count]
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:

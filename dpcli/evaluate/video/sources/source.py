@@ -74,8 +74,8 @@ class Source(ABC):
     """Gives the videos of one object. `pictures` reads the frames of a view in rising order, one in memory at a time.
 
     frames: of each view, None = any (a scene can be seen at any time). has_alpha: whether the object is cut out.
-    rate: frames a second in the mean, None where it isn't known. numbers: those in the names of each view's frames, None
-    where names have none, or several.
+    times: of the frames, rising seconds, None where they aren't known. numbers: those in the names of each view's frames,
+    None where names have none, or several.
     """
 
     path: Path
@@ -83,10 +83,15 @@ class Source(ABC):
     views: list[View]
     frames: list[int] | None
     has_alpha: bool = True
-    rate: float | None = None
+    times: Sequence[float] | None = None
     numbers: Sequence[Sequence[int] | None] | None = None
     header: ViewsHeader | None = None
     history: list[dict] = []
+
+    @property
+    def rate(self) -> float | None:
+        """Returns the frames a second in the mean, None where it isn't known."""
+        return mean_rate(self.times)
 
     @abstractmethod
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:

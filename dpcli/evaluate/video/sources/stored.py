@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.evaluate.video.sources.source import Picture, Source, View, mean_rate
+from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.store.views import ViewsHeader, ViewsReader
 
 
@@ -25,7 +25,7 @@ class ViewsSource(Source):
     def __init__(self, path: Path) -> None:
         self.path, self.reader = path, ViewsReader(path)
         self.header, self.history = self.reader.header, self.reader.provenance
-        roles, self.rate = self.header.role, mean_rate(self.header.time)
+        roles, self.times = self.header.role, self.header.time
         self.views = [View(_view_names(i, role, roles[:i].count(role)), role) for i, role in enumerate(roles)]
         self.frames = [self.header.num_frames] * len(self.views)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import unicodedata
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,22 @@ def gif(path: Path, duration: int) -> Path:
 def test_clips_of_other_rates_are_told(tmp_path: Path) -> None:
     report = evaluate_video(gif(tmp_path / "a.gif", 40), gif(tmp_path / "b.gif", 100))
     assert "The prediction plays 25 frames a second, the truth 10: compared by their number." in report.notes
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "told"),
+    [
+        ([0, 1, 3, 4, 5], [0, 1, 2, 4, 5], "frame 2: after 0.3 s and 0.2 s"),  # each lacks another frame of six
+        ([0, 1, 2, 3, 4], [7, 8, 9, 10, 11], ""),
+        ([0, 1.1, 1.9, 3.1, 4], [0, 0.9, 2.2, 3, 4], ""),  # a camera that isn't even
+    ],
+)
+def test_frames_of_other_moments_are_told(tmp_path: Path, ours: list, theirs: list, told: str) -> None:
+    """Sides of as many frames and the same mean rate, of which each lacks another one: all between are shifted."""
+    for name, own in (("a.h5", ours), ("b.h5", theirs)):
+        write(tmp_path / name, clip(frames=5), replace(header(frames=5), time=np.array(own) / 10))
+    notes = " ".join(evaluate_video(tmp_path / "a.h5", tmp_path / "b.h5", metrics=("psnr",)).notes)
+    assert (f"({told})" in notes) if told else "other moments" not in notes
 
 
 @pytest.mark.parametrize(
