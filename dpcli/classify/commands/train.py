@@ -18,12 +18,14 @@ from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
 from dpcli.classify.data.likeness import file_like, tell_rounded, tell_unlike
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
+    about_absent_classes,
     about_classes,
     about_people,
     carve_validation,
     class_table,
     cross_folds,
     default_rule,
+    lasting_rule,
 )
 from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.config import CROSS
@@ -49,6 +51,7 @@ from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudsReader, input_file
+from dpcli.store.scores import check_class_names
 
 AUTO = "auto"  # the preset that the data choose
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
@@ -81,6 +84,7 @@ class _Videos:
     caveat: str  # see `Training`
     looks: dict[str, float]  # `file_like` of the training videos
     not_read: dict[str, str]  # columns of the file, and why the network doesn't read them
+    rule: str  # `lasting_rule` of what validates
 
 
 def train(
@@ -144,7 +148,7 @@ def _train(
     report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, videos, folder).to(device)
-    info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
+    info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, seed))
     _announce(device, processes, videos, settings)
     keep_freed_memory()
     with (
@@ -214,7 +218,12 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
-    _check_labels(reader, training, validation)
+    if not validation and run.validation not in ("auto", "none"):
+        log.warn(
+            f"--validation {rule}: no class has so many videos that one of them would be held out, so nothing is; ask for a"
+            " larger fraction"
+        )
+    _check_labels(reader, training, validation, rule)
     _tell_unlabeled(reader)
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
@@ -228,10 +237,15 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
-    remarks = about_classes(reader, options.get("folds", {})), about_people(reader, training, validation)
+    remarks = (
+        about_classes(reader, options.get("folds", {})),
+        about_absent_classes(reader, training, validation),
+        about_people(reader, training, validation),
+    )
     caveat = "; ".join(filter(None, remarks))
     digest = provenance.file_digest(path)
-    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out)
+    lasting = lasting_rule(reader, rule, validation)
+    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out, lasting)
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
@@ -249,27 +263,31 @@ def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any
     return json.loads(json.dumps(record))
 
 
-def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
+def _notes(videos: _Videos, seed: int) -> dict[str, Any]:
     """Returns what a weights file says of its making."""
     return {
         "command": provenance.command_line(),
         "data": videos.digest,
         "seed": seed,
-        "validation": rule,
+        "validation": videos.rule,
         "trained_on": f"{counted(videos.counts[0], 'video')}",
         NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }
 
 
-def _check_labels(reader: CloudsReader, training: list[int], validation: list[int]) -> None:
-    """Raises DataError where there is nothing to tell apart; names the classes that training never sees."""
+def _check_labels(reader: CloudsReader, training: list[int], validation: list[int], rule: str) -> None:
+    """Raises DataError where there is nothing to tell apart, or two classes have one name; names the classes that training
+    never sees."""
     names = class_table(reader)
+    check_class_names(reader.path, names)
     seen = {int(reader.labels[i]) for i in training}
     if len(seen) < 2:
+        others = {int(reader.labels[i]) for i in validation} - seen
         raise DataError(
             f"{reader.path}: {counted(len(training), 'training video')}, of class {names[min(seen)]!r} alone;"
             " at least two classes are needed"
+            + (f" (--validation {rule} holds out all videos of the others: give another)" if others else "")
         )
     judged = {int(reader.labels[i]) for i in validation} | set(np.unique(reader.labels[reader.labels >= 0]).tolist())
     missing = [names[label] for label in sorted(judged - seen)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import carve_validation
+from dpcli.classify.data.validation_split import carve_validation, labeled, people_of
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.counted import counted
@@ -59,7 +59,16 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
             f"--split validation: {model_name} learned from all videos, each judged by members that never saw it; the log of its"
             " training has their accuracy (ask for another split)"
         )
-    if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
+    if rule.startswith("subjects:"):
+        people = people_of(rule)
+        found = [i for i in labeled(reader, "train") if int(reader.subjects[i]) in people]
+        if not found:
+            raise DataError(
+                f"{reader.path}: shows none of the people whom {model_name} held out ({rule}) in its split 'train'; predict on the"
+                " file that it was trained on, or ask for another split"
+            )
+        return found
+    if info.notes.get("data") != provenance.file_digest(reader.path):
         raise DataError(
             f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
             f"from that (--validation {rule}); predict on that file"
