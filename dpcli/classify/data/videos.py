@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dpcli.classify.data.clips import ClipSource
@@ -104,16 +106,15 @@ def report_short(source: ClipSource, frames: int) -> None:
         if names:
             log.info(f"{counted(len(names), 'video')} of fewer than {frames} frames, {what}: {first_names(names)}")
     if source.timing != "slots":
-        _report_empty(source)
+        report_empty(source.reader, source.sequences)
 
 
-def _report_empty(source: ClipSource) -> None:
+def report_empty(reader: CloudsReader, sequences: Sequence[int]) -> None:
     """Counts the frames without points, which clips show as points at the origin, and names their videos, with a message."""
-    reader = source.reader
     ends = np.cumsum(reader.frame_counts)
     of = np.searchsorted(ends, np.flatnonzero(reader.frame_sizes == 0), side="right")
     counts = np.bincount(of, minlength=len(ends))
-    found = {i: int(counts[i]) for i in source.sequences if counts[i]}
+    found = {i: int(counts[i]) for i in sequences if counts[i]}
     if found:
         log.warn(
             f"{reader.path}: {counted(sum(found.values()), 'frame')} without points in {counted(len(found), 'video')}"
