@@ -31,6 +31,7 @@ from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
+from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.fine_tune import resolved, settings_from
@@ -96,7 +97,7 @@ def train(
     processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
     for data that can't be learned from.
     """
-    training_settings(_with_preset(given, "quick"))  # what is wrong in any file is refused before it is read
+    _refuse_wrong(given)
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
@@ -106,15 +107,40 @@ def train(
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
 
 
+def _refuse_wrong(given: Given) -> None:
+    """Raises UsageError for settings that are wrong whatever the file holds, before it is read: with the preset `auto` those
+    that fit neither network among which the file chooses, or not the one to go on from."""
+    if given.preset == AUTO and given.values.get("init"):
+        _, info = load_model(find_model(given.values["init"], "--init"), given.values.get("backbone"))
+        preset = PRESETS["sparse" if info.timing == "slots" else "quick"]
+        run = replace(preset["run"], timing=info.timing)
+        training_settings(_without_part(given), {**preset, "network": info.config, "run": run})
+        return
+    problems = []
+    for preset in ("quick", "sparse") if given.preset == AUTO else (given.preset,):
+        try:
+            training_settings(replace(given, preset=preset))
+            return
+        except UsageError as problem:
+            problems.append(problem)
+    raise problems[0]
+
+
+def _without_part(given: Given) -> Given:
+    """Returns what was given but for which part of a model learns, which is in the settings that go on from it."""
+    sets, flags = (
+        {name: value for name, value in own.items() if name != "fine_tune"} for own in (given.sets, given.flags)
+    )
+    return Given("quick", given.config, sets, flags)
+
+
 def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
     """Returns the settings, with what the data choose where a person left it to them."""
     if given.preset == AUTO and given.values.get("init"):
         values = given.values
         _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
         base = settings_from(info, reader, values.get("fine_tune"))
-        sets = {name: value for name, value in given.sets.items() if name != "fine_tune"}
-        flags = {name: value for name, value in given.flags.items() if name != "fine_tune"}
-        return training_settings(Given("quick", given.config, sets, flags), base)
+        return training_settings(_without_part(given), base)
     preset = preset_for(reader, given.values)
     settings = training_settings(_with_preset(given, preset))
     if given.preset == AUTO and preset == "long":
