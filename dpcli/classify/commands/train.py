@@ -250,7 +250,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
             " larger fraction"
         )
     _check_labels(reader, training, validation, rule)
-    _tell_unlabeled(reader)
+    _tell_unlabeled(reader, ("train", "validation") if rule == "split" else ("train",))
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
     left_out: dict[str, str] = {}
@@ -323,16 +323,15 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
         )
 
 
-def _tell_unlabeled(reader: CloudsReader) -> None:
-    """Counts the training videos that nothing can be learned from, with a message."""
-    names = [
-        name for name, split, label in zip(reader.names, reader.splits, reader.labels) if split == "train" and label < 0
-    ]
-    if names:
-        shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
-        log.warn(
-            f"{reader.path}: {counted(len(names), 'video')} of the split 'train' without a label, left out: {shown}"
-        )
+def _tell_unlabeled(reader: CloudsReader, splits: tuple[str, ...]) -> None:
+    """Counts the videos of each of these splits that have no label to learn or to judge by, with a message."""
+    for own in splits:
+        names = [name for name, of, label in zip(reader.names, reader.splits, reader.labels) if of == own and label < 0]
+        if names:
+            shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
+            log.warn(
+                f"{reader.path}: {counted(len(names), 'video')} of the split {own!r} without a label, left out: {shown}"
+            )
 
 
 def check_shares(clips: int, schedule: Schedule, processes: int) -> None:

@@ -63,6 +63,11 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
 
 def _held_out(reader: CloudsReader, chosen: list[int], rule: str) -> set[int]:
     subjects = {int(reader.subjects[i]) for i in chosen}
+    if max(subjects) < 0:
+        raise UsageError(
+            f"--validation {rule}: {reader.path} doesn't say who is seen; a column subject in --labels of `dpc prepare` does, or give"
+            " a fraction such as 0.15"
+        )
     held = {max(subjects)} if rule == "subject" else people_of(rule)
     if not held < subjects:
         raise UsageError(

@@ -425,6 +425,13 @@ def test_what_can_not_be_judged_or_told_apart_is_said(tmp_path, make_sequence, c
         dpc(*words, write("person", [0, 0, 1, 1], [1, 1, 2, 2]), "-o", tmp_path / "c", "--validation", "subject") == 3
     )
     assert "--validation subject holds out all videos of the others" in capfd.readouterr().err
+    assert dpc(*words, uneven, "-o", tmp_path / "c", "--validation", "subject") == 2
+    assert "uneven.h5 doesn't say who is seen" in capfd.readouterr().err
+    with CloudsWriter(tmp_path / "held.h5", class_names=("up", "down")) as writer:
+        for i, label in enumerate((0, 1, 0, -1, -1)):
+            writer.write(make_sequence(f"{i}", label=label, frames=4, split="train" if i < 2 else "validation"))
+    assert dpc(*words, tmp_path / "held.h5", "-o", tmp_path / "e", "--validation", "split") == 0
+    assert "2 videos of the split 'validation' without a label, left out: 3, 4" in capfd.readouterr().err
     twice = write("twice", [0, 0, 1, 2], classes=("up", "down", "up"))
     assert dpc(*words, twice, "-o", tmp_path / "d", "--validation", "none") == 3
     assert "class names repeat, such as 'up'" in capfd.readouterr().err and not (tmp_path / "d").exists()
