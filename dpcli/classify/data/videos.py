@@ -86,6 +86,9 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
         why = "the model was trained for other classes"
         if {*reader.class_names} <= {*info.class_names}:
             why = f"it has these classes at other places; {REORDER}"
+        if not mine and index == len(reader.class_names):
+            have = f"{counted(index, 'class')}, the first of the {len(info.class_names)} of {model_name}"
+            raise DataError(f"{reader.path}: {have}; a map with all of them adds the others: {REORDER}")
         raise DataError(f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; {why}")
 
 

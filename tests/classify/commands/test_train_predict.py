@@ -449,6 +449,10 @@ def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc_here, t
         writer.write(make_sequence("x", label=0, frames=6))
     turned = dpc_here("classify", "predict", tmp_path / "turned.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert turned.returncode == 3 and b"these classes at other places; `dpc prepare merge" in turned.stderr
+    with CloudsWriter(tmp_path / "fewer.h5", class_names=["left"]) as writer:
+        writer.write(make_sequence("x", label=0, frames=6))
+    fewer = dpc_here("classify", "predict", tmp_path / "fewer.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert fewer.returncode == 3 and b"1 class, the first of the 2 of" in fewer.stderr
     dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "scores.h5")
     kind = dpc_here("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert kind.returncode == 3 and b"holds 'scores'" in kind.stderr and not (tmp_path / "s.h5").exists()
