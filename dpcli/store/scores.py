@@ -46,7 +46,7 @@ class ScoresWriter(ResumableWriter):
         self._labels = array("i")
         self._rejected = array("B")
         self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
-        _check_classes(path, options.get("class_names", ()))
+        check_class_names(path, options.get("class_names", ()))
         if wrong := [name for name in self.streams if not name or "/" in name or name == "."]:
             raise DataError(f"{path}: a stream called {wrong[0]!r}; HDF5 needs a name without a slash")
         super().__init__(path, **options)
@@ -172,7 +172,7 @@ class ScoresReader:
             raise DataError(f"{self.path}: rejected has shape {self.rejected.shape}, expected {shape[:1]}")
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
-        _check_classes(self.path, self.class_names)
+        check_class_names(self.path, self.class_names)
         if len(set(self.names)) != len(self.names):
             raise DataError(f"{self.path}: sample names repeat; names identify samples")
         if len(self.labels) and (self.labels.min() < -1 or self.labels.max() >= shape[1]):
@@ -182,7 +182,7 @@ class ScoresReader:
             )
 
 
-def _check_classes(path: str | Path, class_names: Sequence[str]) -> None:
+def check_class_names(path: str | Path, class_names: Sequence[str]) -> None:
     """Raises DataError where two classes have one name; several may have none."""
     twice = sorted(name for name, count in Counter(class_names).items() if name and count > 1)
     if twice:

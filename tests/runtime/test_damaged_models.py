@@ -85,6 +85,20 @@ def test_a_header_with_a_wrong_value_is_refused_by_name(make, tmp_path):
     assert refused > 0.4 * len(changes)
 
 
+def test_classes_may_have_any_name_that_a_file_of_clouds_can_hold(tmp_path):
+    """Joiners, no-break spaces and tabs came as far as the weights, which then could not be read."""
+    load = _kinet(tmp_path / "whole.safetensors")
+    for names in (["نمی\u200cخواهم", "no\u00a0break", "tab\tx"], ["👩\u200d👧", "", "a\nb"]):
+        _rewritten(tmp_path / "named.safetensors", tmp_path / "whole.safetensors", class_names=json.dumps(names))
+        assert load(tmp_path / "named.safetensors")[1].class_names == names
+    for wrong in ("a\0b", "\ud800", 3):
+        _rewritten(
+            tmp_path / "named.safetensors", tmp_path / "whole.safetensors", class_names=json.dumps([wrong, "b", "c"])
+        )
+        with pytest.raises(DataError, match="expected 3 names|surrogate"):
+            load(tmp_path / "named.safetensors")
+
+
 def test_a_configuration_of_more_weights_than_the_file_holds_takes_no_memory(tmp_path):
     whole, path = tmp_path / "whole.safetensors", tmp_path / "changed.safetensors"
     load = _kinet(whole)

@@ -10,7 +10,9 @@ import numpy as np
 
 from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.descriptors import descriptors
+from dpcli.counted import counted
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import scikit_learn_state
@@ -70,6 +72,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         for learned, judged in rounds:
             scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)
         judged = np.flatnonzero(np.isfinite(scores[:, 0]))
+        _tell_unknown_classes(reader, labels, rounds, len(judged))
         if output:
             _write(reader, known[judged], scores[judged], output, seed, force)
         right = int((scores[judged].argmax(1) == labels[judged]).sum())
@@ -108,6 +111,20 @@ def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iter
     if fewest < _STEADY:
         log.warn(f"{reader.path}: a class has only {fewest} videos; the accuracy is unreliable")
     yield from StratifiedKFold(min(_FOLDS, fewest), shuffle=True, random_state=0).split(known, labels)
+
+
+def _tell_unknown_classes(
+    reader: CloudsReader, labels: np.ndarray, rounds: list[tuple[np.ndarray, np.ndarray]], judged: int
+) -> None:
+    """Warns of judged videos whose class no forest that judged them had learned: they can't be right."""
+    lost = np.concatenate([own[~np.isin(labels[own], labels[learned])] for learned, own in rounds])
+    if len(lost):
+        table = reader.class_names or [str(label) for label in range(int(labels.max()) + 1)]
+        names = [table[label] for label in np.unique(labels[lost])]
+        log.warn(
+            f"{reader.path}: {len(lost)} of {counted(judged, 'judged video')} count as wrong, since no other video of their"
+            f" class was there to learn from: {first_names(names)}"
+        )
 
 
 def _forest_scores(

@@ -60,6 +60,7 @@ def fuse(
         readers = [ScoresReader(path) for path in paths]
         streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
+        _tell_rejected(readers, called)
         if judges:
             held = [ScoresReader(name) for name in judges]
             _tell_other_models(held, judges, readers, called)
@@ -141,6 +142,17 @@ def _streams(
 def _labels(sources: Sequence[ScoresReader], rows: Sequence[np.ndarray]) -> np.ndarray:
     """Returns the labels i32 (S); one that only some files know is taken from them."""
     return np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
+
+
+def _tell_rejected(readers: Sequence[ScoresReader], called: Sequence[str]) -> None:
+    """Warns of files that mark videos as not recognized: fused scores have no such marks, as thresholds were for single ones."""
+    for reader, name in zip(readers, called):
+        if reader.rejected is not None and reader.rejected.any():
+            count = int(reader.rejected.sum())
+            log.warn(
+                f"{name}: marks {counted(count, 'video')} as not recognized; the fused scores mark none, since its threshold was"
+                " for its own scores"
+            )
 
 
 def _tell_other_models(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,12 +12,14 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import choose_confidence
 from dpcli.classify.data.clips import check_columns
 from dpcli.classify.data.likeness import file_like, tell_unlike
-from dpcli.classify.data.videos import check_classes, select_videos
+from dpcli.classify.data.videos import check_classes, report_empty, select_videos
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
 from dpcli.classify.stream.sliding_window import StreamPredictor, window_size
+from dpcli.counted import counted as numbered
 from dpcli.errors import UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import Progress, log
@@ -55,6 +57,7 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
         check_columns(reader, info.config)
         chosen = select_videos(reader, task.split, info, task.model)
         tell_unlike(str(path), file_like(reader, chosen), info, task.model)
+        _tell_odd(reader, chosen, info, how.window)
         keep_freed_memory()
         recordings = {}
         with Progress("classify predict --segments", int(reader.frame_counts[chosen].sum()), "frame") as bar:
@@ -67,6 +70,18 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
     if task.output != "-":
         write_whole(Path(str(task.output)), text.encode())
     return found, text
+
+
+def _tell_odd(reader: CloudsReader, chosen: Sequence[int], info: ModelInfo, window: int) -> None:
+    """Counts and names the recordings that one window sees whole, and those with frames without points, with a message each."""
+    short = [reader.names[i] for i in chosen if reader.frame_counts[i] < window]
+    if short:
+        log.info(
+            f"{numbered(len(short), 'recording')} of fewer than {numbered(window, 'frame')}, a window, so one segment each:"
+            f" {first_names(short)}"
+        )
+    if info.timing != "slots":
+        report_empty(reader, chosen)
 
 
 def _suffix(task: ModelTask) -> str:

@@ -18,17 +18,20 @@ from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
 from dpcli.classify.data.likeness import file_like, tell_rounded, tell_unlike
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
+    about_absent_classes,
     about_classes,
     about_people,
     carve_validation,
     class_table,
     cross_folds,
     default_rule,
+    lasting_rule,
 )
 from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
+from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.fine_tune import resolved, settings_from
@@ -49,6 +52,7 @@ from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudsReader, input_file
+from dpcli.store.scores import check_class_names
 
 AUTO = "auto"  # the preset that the data choose
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
@@ -81,6 +85,7 @@ class _Videos:
     caveat: str  # see `Training`
     looks: dict[str, float]  # `file_like` of the training videos
     not_read: dict[str, str]  # columns of the file, and why the network doesn't read them
+    rule: str  # `lasting_rule` of what validates
 
 
 def train(
@@ -92,7 +97,7 @@ def train(
     processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
     for data that can't be learned from.
     """
-    training_settings(_with_preset(given, "quick"))  # what is wrong in any file is refused before it is read
+    _refuse_wrong(given)
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
@@ -102,15 +107,40 @@ def train(
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
 
 
+def _refuse_wrong(given: Given) -> None:
+    """Raises UsageError for settings that are wrong whatever the file holds, before it is read: with the preset `auto` those
+    that fit neither network among which the file chooses, or not the one to go on from."""
+    if given.preset == AUTO and given.values.get("init"):
+        _, info = load_model(find_model(given.values["init"], "--init"), given.values.get("backbone"))
+        preset = PRESETS["sparse" if info.timing == "slots" else "quick"]
+        run = replace(preset["run"], timing=info.timing)
+        training_settings(_without_part(given), {**preset, "network": info.config, "run": run})
+        return
+    problems = []
+    for preset in ("quick", "sparse") if given.preset == AUTO else (given.preset,):
+        try:
+            training_settings(replace(given, preset=preset))
+            return
+        except UsageError as problem:
+            problems.append(problem)
+    raise problems[0]
+
+
+def _without_part(given: Given) -> Given:
+    """Returns what was given but for which part of a model learns, which is in the settings that go on from it."""
+    sets, flags = (
+        {name: value for name, value in own.items() if name != "fine_tune"} for own in (given.sets, given.flags)
+    )
+    return Given("quick", given.config, sets, flags)
+
+
 def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
     """Returns the settings, with what the data choose where a person left it to them."""
     if given.preset == AUTO and given.values.get("init"):
         values = given.values
         _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
         base = settings_from(info, reader, values.get("fine_tune"))
-        sets = {name: value for name, value in given.sets.items() if name != "fine_tune"}
-        flags = {name: value for name, value in given.flags.items() if name != "fine_tune"}
-        return training_settings(Given("quick", given.config, sets, flags), base)
+        return training_settings(_without_part(given), base)
     preset = preset_for(reader, given.values)
     settings = training_settings(_with_preset(given, preset))
     if given.preset == AUTO and preset == "long":
@@ -144,7 +174,7 @@ def _train(
     report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, videos, folder).to(device)
-    info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
+    info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, seed))
     _announce(device, processes, videos, settings)
     keep_freed_memory()
     with (
@@ -214,8 +244,13 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
-    _check_labels(reader, training, validation)
-    _tell_unlabeled(reader)
+    if not validation and run.validation not in ("auto", "none"):
+        log.warn(
+            f"--validation {rule}: no class has so many videos that one of them would be held out, so nothing is; ask for a"
+            " larger fraction"
+        )
+    _check_labels(reader, training, validation, rule)
+    _tell_unlabeled(reader, ("train", "validation") if rule == "split" else ("train",))
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
     left_out: dict[str, str] = {}
@@ -228,10 +263,15 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
-    remarks = about_classes(reader, options.get("folds", {})), about_people(reader, training, validation)
+    remarks = (
+        about_classes(reader, options.get("folds", {})),
+        about_absent_classes(reader, training, validation),
+        about_people(reader, training, validation),
+    )
     caveat = "; ".join(filter(None, remarks))
     digest = provenance.file_digest(path)
-    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out)
+    lasting = lasting_rule(reader, rule, validation)
+    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out, lasting)
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
@@ -249,27 +289,31 @@ def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any
     return json.loads(json.dumps(record))
 
 
-def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
+def _notes(videos: _Videos, seed: int) -> dict[str, Any]:
     """Returns what a weights file says of its making."""
     return {
         "command": provenance.command_line(),
         "data": videos.digest,
         "seed": seed,
-        "validation": rule,
+        "validation": videos.rule,
         "trained_on": f"{counted(videos.counts[0], 'video')}",
         NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }
 
 
-def _check_labels(reader: CloudsReader, training: list[int], validation: list[int]) -> None:
-    """Raises DataError where there is nothing to tell apart; names the classes that training never sees."""
+def _check_labels(reader: CloudsReader, training: list[int], validation: list[int], rule: str) -> None:
+    """Raises DataError where there is nothing to tell apart, or two classes have one name; names the classes that training
+    never sees."""
     names = class_table(reader)
+    check_class_names(reader.path, names)
     seen = {int(reader.labels[i]) for i in training}
     if len(seen) < 2:
+        others = {int(reader.labels[i]) for i in validation} - seen
         raise DataError(
             f"{reader.path}: {counted(len(training), 'training video')}, of class {names[min(seen)]!r} alone;"
             " at least two classes are needed"
+            + (f" (--validation {rule} holds out all videos of the others: give another)" if others else "")
         )
     judged = {int(reader.labels[i]) for i in validation} | set(np.unique(reader.labels[reader.labels >= 0]).tolist())
     missing = [names[label] for label in sorted(judged - seen)]
@@ -279,16 +323,15 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
         )
 
 
-def _tell_unlabeled(reader: CloudsReader) -> None:
-    """Counts the training videos that nothing can be learned from, with a message."""
-    names = [
-        name for name, split, label in zip(reader.names, reader.splits, reader.labels) if split == "train" and label < 0
-    ]
-    if names:
-        shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
-        log.warn(
-            f"{reader.path}: {counted(len(names), 'video')} of the split 'train' without a label, left out: {shown}"
-        )
+def _tell_unlabeled(reader: CloudsReader, splits: tuple[str, ...]) -> None:
+    """Counts the videos of each of these splits that have no label to learn or to judge by, with a message."""
+    for own in splits:
+        names = [name for name, of, label in zip(reader.names, reader.splits, reader.labels) if of == own and label < 0]
+        if names:
+            shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
+            log.warn(
+                f"{reader.path}: {counted(len(names), 'video')} of the split {own!r} without a label, left out: {shown}"
+            )
 
 
 def check_shares(clips: int, schedule: Schedule, processes: int) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from dpcli.classify.network.config import CROSS
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
 
@@ -62,18 +63,25 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
 
 def _held_out(reader: CloudsReader, chosen: list[int], rule: str) -> set[int]:
     subjects = {int(reader.subjects[i]) for i in chosen}
-    if rule == "subject":
-        held = {max(subjects)}
-    else:
-        try:
-            held = {int(word) for word in rule.split(":", 1)[1].split(",")}
-        except (IndexError, ValueError):
-            raise UsageError(f"--validation {rule}: expected subjects:3,5") from None
+    if max(subjects) < 0:
+        raise UsageError(
+            f"--validation {rule}: {reader.path} doesn't say who is seen; a column subject in --labels of `dpc prepare` does, or give"
+            " a fraction such as 0.15"
+        )
+    held = {max(subjects)} if rule == "subject" else people_of(rule)
     if not held < subjects:
         raise UsageError(
             f"--validation {rule}: training subjects are {sorted(subjects)}; hold out some of them, not all"
         )
     return held
+
+
+def people_of(rule: str) -> set[int]:
+    """Returns the people that a rule such as `subjects:3,5` names. Raises UsageError where it names none."""
+    try:
+        return {int(word) for word in rule.split(":", 1)[1].split(",")}
+    except (IndexError, ValueError):
+        raise UsageError(f"--validation {rule}: expected subjects:3,5") from None
 
 
 def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int) -> tuple[list[int], list[int]]:
@@ -134,6 +142,14 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
     return [i for i, k in zip(chosen, of) if k != which], [i for i, k in zip(chosen, of) if k == which]
 
 
+def lasting_rule(reader: CloudsReader, rule: str, validation: list[int]) -> str:
+    """Returns the rule that says later, of other files too, what was held out: a person by number, as another file may have
+    others, and `none` where a rule found nothing to hold out."""
+    if not validation:
+        return "none"
+    return f"subjects:{int(reader.subjects[validation[0]])}" if rule == "subject" else rule
+
+
 def default_rule(reader: CloudsReader, members: int = 1) -> str:
     """Returns `split` when the file has labeled validation videos, `cross` for a network of several members, or `none` where
     each class has one video, `subject` when the training videos have several known subjects, else 15 % of each class."""
@@ -160,6 +176,19 @@ def about_classes(reader: CloudsReader, judges: dict[int, int]) -> str:
     return (
         f"{lone} of these videos count as wrong, since all of their class, such as one video or one person's, were held out"
         " together; new videos may come out better"
+    )
+
+
+def about_absent_classes(reader: CloudsReader, training: list[int], validation: list[int]) -> str:
+    """Returns which of the classes that were learned no validation video shows, for the user, "" where all are there or nothing
+    is held out."""
+    learned, judged = ({int(reader.labels[i]) for i in some} for some in (training, validation))
+    absent = [class_table(reader)[label] for label in sorted(learned - judged)]
+    if not judged or not absent:
+        return ""
+    return (
+        f"none of them is of {len(absent)} of the {len(learned)} classes that were learned: {first_names(absent)}; how well these are"
+        " recognized is unknown"
     )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import carve_validation
+from dpcli.classify.data.validation_split import carve_validation, labeled, people_of
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.counted import counted
@@ -59,7 +61,16 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
             f"--split validation: {model_name} learned from all videos, each judged by members that never saw it; the log of its"
             " training has their accuracy (ask for another split)"
         )
-    if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
+    if rule.startswith("subjects:"):
+        people = people_of(rule)
+        found = [i for i in labeled(reader, "train") if int(reader.subjects[i]) in people]
+        if not found:
+            raise DataError(
+                f"{reader.path}: shows none of the people whom {model_name} held out ({rule}) in its split 'train'; predict on the"
+                " file that it was trained on, or ask for another split"
+            )
+        return found
+    if info.notes.get("data") != provenance.file_digest(reader.path):
         raise DataError(
             f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
             f"from that (--validation {rule}); predict on that file"
@@ -75,6 +86,9 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
         why = "the model was trained for other classes"
         if {*reader.class_names} <= {*info.class_names}:
             why = f"it has these classes at other places; {REORDER}"
+        if not mine and index == len(reader.class_names):
+            have = f"{counted(index, 'class')}, the first of the {len(info.class_names)} of {model_name}"
+            raise DataError(f"{reader.path}: {have}; a map with all of them adds the others: {REORDER}")
         raise DataError(f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; {why}")
 
 
@@ -95,16 +109,15 @@ def report_short(source: ClipSource, frames: int) -> None:
         if names:
             log.info(f"{counted(len(names), 'video')} of fewer than {frames} frames, {what}: {first_names(names)}")
     if source.timing != "slots":
-        _report_empty(source)
+        report_empty(source.reader, source.sequences)
 
 
-def _report_empty(source: ClipSource) -> None:
+def report_empty(reader: CloudsReader, sequences: Sequence[int]) -> None:
     """Counts the frames without points, which clips show as points at the origin, and names their videos, with a message."""
-    reader = source.reader
     ends = np.cumsum(reader.frame_counts)
     of = np.searchsorted(ends, np.flatnonzero(reader.frame_sizes == 0), side="right")
     counts = np.bincount(of, minlength=len(ends))
-    found = {i: int(counts[i]) for i in source.sequences if counts[i]}
+    found = {i: int(counts[i]) for i in sequences if counts[i]}
     if found:
         log.warn(
             f"{reader.path}: {counted(sum(found.values()), 'frame')} without points in {counted(len(found), 'video')}"

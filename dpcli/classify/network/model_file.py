@@ -66,10 +66,15 @@ def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, Mo
     timing = header.get("timing")
     if timing not in ("clips", "uniform", "slots"):
         raise DataError(f"{path}: timing = {timing!r}, expected clips, uniform or slots; copy it again")
-    if len(names) != config.num_classes or not all(isinstance(name, str) and name.isprintable() for name in names):
+    if len(names) != config.num_classes or not all(map(_is_text, names)):
         raise DataError(f"{path}: class_names = {names!r:.80}, expected {config.num_classes} names; copy it again")
     streams = notes.get("streams", list(STREAMS))
     if streams not in (list(STREAMS), *([one] for one in STREAMS)):
         raise DataError(f"{path}: streams = {streams!r:.80} in its notes, expected some of {', '.join(STREAMS)}")
     network = fill_network(lambda: Kinet(config), tensors, path)
     return network, ModelInfo(config, names, timing, notes)
+
+
+def _is_text(name: object) -> bool:
+    """Returns whether a name is one that a `clouds` file can hold, such as one with a no-break space or a joiner, too."""
+    return isinstance(name, str) and "\0" not in name

@@ -21,10 +21,12 @@ class SyncNorm(nn.BatchNorm1d):
             )
         rows = values.transpose(0, 1).flatten(1).to(self.running_mean.dtype)  # (C, everything else)
         # Two passes as torch does: squares about the common mean keep digits that a difference of sums would lose.
-        count = _summed(rows.new_full((1,), rows.shape[1]))
+        rows_of_all = _summed(rows.new_full((1,), rows.shape[1]))
+        count = rows_of_all.clamp(min=1)
         mean = _summed(rows.sum(1)) / count
         var = _summed((rows - mean[:, None]).square().sum(1)) / count
-        self._remember(mean.detach(), var.detach() * count / (count - 1).clamp(min=1))
+        if rows_of_all > 0:
+            self._remember(mean.detach(), var.detach() * count / (count - 1).clamp(min=1))
         scale = self.weight * torch.rsqrt(var + self.eps)
         shape = (1, -1) + (1,) * (values.dim() - 2)
         return values * scale.view(shape) + (self.bias - mean * scale).view(shape)
@@ -56,6 +58,11 @@ class _Sum(torch.autograd.Function):
 
 def _summed(values: Tensor) -> Tensor:
     return _Sum.apply(values)
+
+
+def has_synchronized_norms(module: nn.Module) -> bool:
+    """Returns whether a norm inside waits for all processes, each of which must then call the module equally often."""
+    return any(isinstance(one, SyncNorm) for one in module.modules())
 
 
 def synchronize_norms(module: nn.Module) -> nn.Module:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -77,7 +78,7 @@ def cut(found: WindowScores, class_names: Sequence[str], how: Cutting) -> list[S
     evidence = np.log(np.maximum(probabilities, 1e-12))
     nothing = np.log(how.confidence.threshold) if how.confidence.threshold > 0 else -np.inf
     evidence = np.column_stack([evidence, np.full(len(evidence), nothing)])
-    least = max(1, round(how.shortest / how.hop))
+    least = max(1, -(-how.shortest // how.hop))  # steps of a hop each
     certain = -np.log(max(how.confidence.threshold, 1 / len(class_names)))  # what chance has, where nothing is rejected
     path = best_path(evidence * min(1.0, how.hop / how.window), least, _CHANGE * certain)
     return [_segment(found, probabilities, class_names, how, *run, int(path[run[0]])) for run in runs(path)]
@@ -108,4 +109,4 @@ def _edge(found: WindowScores, how: Cutting, at: int) -> int:
     if at == len(found.last):
         return found.frames
     middle = (found.last[at - 1] + found.last[at]) / 2 - (how.window - 1) / 2
-    return int(round(middle + 0.5))
+    return math.floor(middle + 1)  # halves go up everywhere, so that hops between two edges keep their length

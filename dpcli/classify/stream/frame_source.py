@@ -20,6 +20,7 @@ _POLL = 0.02  # seconds between looks at a file or folder that may grow
 _SETTLED = 0.1  # seconds a folder's newest file must stay unchanged to count as whole
 _PIECE = 1 << 20
 _MOST_POINTS = 10_000_000  # in one frame: a damaged header must not ask for all memory
+_MOST_NUMBERS = 64  # of a point
 _MAGIC, _HDF5 = b"\x93NUMPY", b"\x89HDF"
 _RECIPE = "expected frames written one after another by numpy.save(pipe, points)"
 
@@ -117,6 +118,10 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[
             )
         if number == 0 and shape[1] > 3 + len(columns):
             log.info(f"{name}: arrays of {shape[1]} columns; the first 3 are read, as x, y, z")
+            if shape[0] == 3:
+                log.warn(
+                    f"{where}: 3 rows of {shape[1]} numbers; if the rows are x, y and z, send the array transposed"
+                )
         body = source.read(int(np.prod(shape)) * dtype.itemsize)
         if (cut := body.find(_MAGIC + b"\x01\x00")) >= 0:  # no coordinates look like this: the next frame begins here
             log.warn(
@@ -143,9 +148,14 @@ def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], 
         raise DataError(f"{where}: damaged .npy header ({error}); {_RECIPE}") from None
     if len(shape) != 2 or shape[1] < 3 or dtype.kind not in "uif":
         raise DataError(f"{where}: array of shape {shape}, {dtype}; expected one frame's float32 (points, 3)")
-    if not 0 <= shape[0] <= _MOST_POINTS or shape[1] > 64:
+    if shape[0] == 3 and shape[1] > _MOST_NUMBERS:
         raise DataError(
-            f"{where}: its header says {shape}; expected at most {_MOST_POINTS:,} points (a damaged stream?)"
+            f"{where}: array of shape {shape}; expected a row for each point, (points, 3): send it transposed"
+        )
+    if not 0 <= shape[0] <= _MOST_POINTS or shape[1] > _MOST_NUMBERS:
+        raise DataError(
+            f"{where}: its header says {shape}; expected at most {_MOST_POINTS:,} points of {_MOST_NUMBERS} numbers (a damaged"
+            " stream?)"
         )
     return shape, fortran, dtype
 

@@ -41,6 +41,7 @@ class EpochBatches:
         self.source, self.schedule, self.processes, self.stage = source, schedule, processes, stage
         self.share = schedule.share(processes.count) * schedule.accumulate  # clips of a batch that are this process's
         self.clips = len(self._draw(0))  # of an epoch
+        self.size = min(schedule.batch, self.clips)  # clips of a batch, of all processes together
         self.count = max(self.clips // schedule.batch, 1)  # whole batches; clips left over come in another epoch
 
     @property

@@ -92,9 +92,9 @@ class Trainer:
         if self.optimize is None:
             self.optimize = self._new_step(data)
         self.watch = watch_of(self.info.config.num_classes)
-        clips = data.count * self.schedule.batch
+        clips = data.count * data.size
         with Progress(f"train {STREAMS[self.stage]}", epochs * clips, "clip") as bar:
-            bar.skip(self.epoch * clips + self.step * self.schedule.batch)
+            bar.skip(self.epoch * clips + self.step * data.size)
             while self.epoch < epochs:
                 self._run_epoch(data, epochs, bar)
 
@@ -123,7 +123,7 @@ class Trainer:
             stopping = self._take(*batch, rate)
             loss, accuracy = self._means()
             bar.note(epoch=f"{self.epoch + 1}/{epochs}", loss=loss, accuracy=accuracy)
-            bar.advance(self.schedule.batch)
+            bar.advance(data.size)
             if stopping:
                 self._stop_here(started)
         self._end_epoch(rate, started)

@@ -89,6 +89,19 @@ def test_people_of_both_splits_are_told(tmp_path):
     assert "people never seen come out lower" in command.baseline(str(tmp_path / "b.h5")).seen
 
 
+def test_judged_videos_of_a_class_that_nothing_was_learned_of_are_told(tmp_path, capsys):
+    write(tmp_path / "a.h5")
+    with CloudsReader(tmp_path / "a.h5") as reader, CloudsWriter(tmp_path / "b.h5", class_names=UP) as writer:
+        for index in range(len(reader)):
+            sequence = reader.read(index)
+            sequence.split = "test" if sequence.label == 2 else sequence.split
+            writer.write(sequence)
+    command.baseline(str(tmp_path / "b.h5"))
+    assert "8 of 12 judged videos count as wrong" in (said := capsys.readouterr().err) and ": still" in said
+    command.baseline(str(tmp_path / "a.h5"))
+    assert "count as wrong" not in capsys.readouterr().err
+
+
 def test_too_few_videos_are_refused_by_name(tmp_path, capsys):
     with pytest.raises(DataError, match="a class of one video and no test split"):
         command.baseline(write(tmp_path / "a.h5", splits=False, people=False, lone=True))

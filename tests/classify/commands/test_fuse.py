@@ -325,3 +325,12 @@ def test_scores_that_are_no_probabilities_are_refused(row, two, tmp_path):
     with pytest.raises(DataError, match=r"odd.h5: scores of 'v1' are not probabilities \(1 such samples\)"):
         fuse([two[0], odd], tmp_path / "out.h5")
     assert not (tmp_path / "out.h5").exists()
+
+
+def test_marks_that_fused_scores_do_not_keep_are_told(tmp_path, capsys):
+    for name, rejected in (("a", True), ("b", False)):
+        with ScoresWriter(tmp_path / f"{name}.h5", class_names=["x", "y"], rejects=True) as writer:
+            writer.write("v", np.array([0.5, 0.5], np.float32), rejected=rejected)
+    fuse([str(tmp_path / "a.h5"), str(tmp_path / "b.h5")], str(tmp_path / "c.h5"))
+    assert "a.h5: marks 1 video as not recognized" in (said := capsys.readouterr().err) and "b.h5" not in said
+    assert ScoresReader(tmp_path / "c.h5").rejected is None

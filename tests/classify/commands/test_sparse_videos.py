@@ -120,6 +120,16 @@ def test_one_or_two_videos_a_class_and_one_person_train(videos, people, tmp_path
     assert done.videos == (0 if videos == 2 else 4)  # one training video a class: no judge could have seen its class
 
 
+def test_what_fits_the_network_that_the_data_choose_is_not_refused_for_another(tmp_path, capsys):
+    data = radar(tmp_path / "r.h5", 4)
+    flags = {"epochs": 0, "validation": "cross", "frames": 4, "points": 6}  # fewer points than `quick` has centroids
+    done = command.train(str(data), str(tmp_path / "run"), Given("auto", sets=SHORT, flags=flags))
+    assert load_model(done.weights)[1].config.num_frames == 4 and done.videos == 6
+    for words in (("--set", "epoch=3"), ("--frames", "2", "--points", "16", "--preset", "quick")):
+        assert dpc("classify", "train", tmp_path / "none.h5", "-o", tmp_path / "x", *words) == 2
+    assert "did you mean epochs" in (said := capsys.readouterr().err) and "centroids" in said and "none.h5" not in said
+
+
 def test_one_class_is_refused_and_time_that_runs_back_is_told(tmp_path, capsys):
     assert dpc("classify", "train", radar(tmp_path / "one.h5", 3, classes=1), "-o", tmp_path / "run") == 3
     assert "at least two classes are needed" in capsys.readouterr().err

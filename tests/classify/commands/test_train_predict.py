@@ -20,7 +20,7 @@ from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.data.videos import held_out
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import ModelInfo, load_model
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from tests.support.commands import exit_code
 
@@ -228,10 +228,16 @@ def test_held_out_videos(data):
                     f"s{i}", [np.zeros((4, 3), np.float32)], label=i % 2, split="train", subject=subject
                 )
             )
-    info.notes["validation"] = "subject"  # needs no digest: whoever has the highest number
-    assert held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model") == [2, 3]
-    info.notes["validation"] = "subjects:3"
+    info.notes["validation"] = "subjects:3"  # needs no digest: a person has one number in all files
     assert held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model") == [0, 1]
+    info.notes["validation"] = "subjects:9"
+    with pytest.raises(DataError, match="none of the people whom a model held out"):
+        held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model")
+    info.notes["validation"] = (
+        "subject"  # of weights from before: another file's highest number may be one that was learned
+    )
+    with pytest.raises(DataError, match="not the file that a model was trained on"):
+        held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model")
 
 
 def last_weights(folder: Path) -> dict:
@@ -443,6 +449,10 @@ def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc_here, t
         writer.write(make_sequence("x", label=0, frames=6))
     turned = dpc_here("classify", "predict", tmp_path / "turned.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert turned.returncode == 3 and b"these classes at other places; `dpc prepare merge" in turned.stderr
+    with CloudsWriter(tmp_path / "fewer.h5", class_names=["left"]) as writer:
+        writer.write(make_sequence("x", label=0, frames=6))
+    fewer = dpc_here("classify", "predict", tmp_path / "fewer.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert fewer.returncode == 3 and b"1 class, the first of the 2 of" in fewer.stderr
     dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "scores.h5")
     kind = dpc_here("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert kind.returncode == 3 and b"holds 'scores'" in kind.stderr and not (tmp_path / "s.h5").exists()

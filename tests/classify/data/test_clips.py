@@ -20,7 +20,14 @@ from dpcli.classify.data.clips import (
     sample_points,
     uniform_frames,
 )
-from dpcli.classify.data.validation_split import about_people, carve_validation, default_rule, folds
+from dpcli.classify.data.validation_split import (
+    about_absent_classes,
+    about_people,
+    carve_validation,
+    default_rule,
+    folds,
+    lasting_rule,
+)
 from dpcli.classify.data.videos import report_short
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.settings import training_settings
@@ -256,6 +263,24 @@ def test_people_who_train_and_validate_are_told(tmp_path, make_sequence, subject
     said = about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], [2, 3])
     assert said.startswith(told) and bool(said) == bool(told)
     assert about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], []) == ""
+
+
+def test_what_was_held_out_is_named_so_that_it_holds_for_other_files(tmp_path, make_sequence):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b", "c"]) as writer:
+        for k, (label, subject) in enumerate([(0, 1), (1, 1), (2, 1), (0, 4), (1, 4)]):
+            writer.write(make_sequence(f"v{k}", label=label, split="train", subject=subject))
+    reader = CloudsReader(tmp_path / "own.h5")
+    training, held = carve_validation(reader, "subject", 0)
+    assert (
+        lasting_rule(reader, "subject", held) == "subjects:4" and lasting_rule(reader, "fold:0/2", held) == "fold:0/2"
+    )
+    assert (
+        lasting_rule(reader, "0.1", carve_validation(reader, "0.1", 0)[1]) == "none"
+    )  # of classes of two videos: nothing
+    assert about_absent_classes(reader, training, held).startswith(
+        "none of them is of 1 of the 3 classes that were learned: c;"
+    )
+    assert about_absent_classes(reader, training, training) == about_absent_classes(reader, training, []) == ""
 
 
 def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):

@@ -72,5 +72,5 @@ def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):
     assert file_like(reader, [0, 1])["frames"] == 400
     tell_long(reader, [0, 1], ModelInfo(KinetConfig(), ["a"]), SHIPPED / "msraction3d-24.safetensors")
     assert "1 of 2 videos over 5 times as long as any" in capsys.readouterr().err
-    _tell_unlabeled(reader)
+    _tell_unlabeled(reader, ("train",))
     assert "1 video of the split 'train' without a label, left out: long" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from dpcli.classify.data.validation_split import (
     cross_folds,
     default_rule,
 )
+from dpcli.classify.network import sync_norm
 from dpcli.classify.network.backbones.point_slots import slot_quantiles
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.settings import network_config
@@ -136,6 +137,24 @@ def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
     for k, member in ((0, 0), (1, 1), (2, 0)):
         alone = model.static.members[member].scores(clips[k : k + 1], NO_FOREST)
         assert torch.allclose(scores[k], alone[0], atol=1e-6)
+
+
+def test_processes_that_share_a_batch_wait_for_one_another_equally_often(tmp_path, monkeypatch):
+    """A member without a clip in one process still joins the sums of norms; they would mix with another member's."""
+    config = config_of(tmp_path, [video()]).changed(copies=True, slot_details=True)
+    clip = torch.from_numpy(in_slots(slot_rows(video(), config), config, np.random.default_rng(0)))[None]
+    calls = []
+    monkeypatch.setattr(sync_norm, "_summed", lambda values: calls.append(tuple(values.shape)) or values)
+    counts = []
+    for clips in (clip, clip.repeat(2, 1, 1, 1)):  # for one member of two, and for both
+        model = Kinet(config).train()
+        sync_norm.synchronize_norms(model)
+        calls.clear()
+        model.static_logits(clips).sum().backward()
+        counts.append(list(calls))
+        assert all(torch.isfinite(value).all() for value in model.state_dict().values())
+        assert all(one.grad is not None for member in model.static.members for one in member.parameters())
+    assert counts[0] == counts[1] and counts[0]
 
 
 def test_copies_are_mirrored_or_reversed_and_have_classifiers_of_their_own(tmp_path):

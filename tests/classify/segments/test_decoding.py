@@ -82,3 +82,16 @@ def test_an_action_between_pauses_is_found_whatever_the_threshold(threshold):
 def test_one_window_is_one_segment():
     how = Cutting(window=8, hop=4, shortest=100, confidence=Confidence())
     assert [(one.start, one.end, one.name) for one in cut(windows([1]), ["a", "b"], how)] == [(0, 10, "b")]
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_no_segment_is_shorter_than_was_asked_for(seed):
+    """Whatever window, hop and length; a hop that doesn't divide the length made segments too short."""
+    rng = np.random.default_rng(seed)
+    window = int(rng.integers(4, 40))
+    hop, shortest, frames = rng.integers((1, 1, window), (window + 1, 2 * window, window + 400)).tolist()
+    last = np.arange(window - 1, frames, hop)
+    found = WindowScores(last, rng.dirichlet(np.full(3, 0.2), len(last)), frames)
+    made = cut(found, ["a", "b", "c"], Cutting(window, hop, shortest, Confidence(threshold=0.3)))
+    assert [one.start for one in made] == [0, *(one.end for one in made[:-1])] and made[-1].end == frames
+    assert len(made) == 1 or min(one.end - one.start for one in made) >= shortest

@@ -68,7 +68,14 @@ def test_a_number_rejects_all_and_the_shortest_length_is_kept(model, tmp_path, c
     assert run(clouds, "--model", model, "-o", "-", "--reject-below", 1) == 0
     assert {row["class"] for own in rows(capsys.readouterr().out).values() for row in own} == {""}
     assert run(clouds, "--model", model, "-o", "-", "--shortest", 10) == 0
-    assert all(int(row["end"]) - int(row["start"]) >= 9 for row in rows(capsys.readouterr().out)["long"])
+    assert all(int(row["end"]) - int(row["start"]) >= 10 for row in rows(capsys.readouterr().out)["long"])
+
+
+def test_frames_without_points_and_short_recordings_are_told(model, tmp_path, capsys):
+    assert run(recordings(tmp_path / "c.h5"), "--model", model, "-o", "-") == 0
+    said = capsys.readouterr().err
+    assert "1 frame without points in 1 video taken as points at the origin: long" in said
+    assert "1 recording of fewer than" in said and "so one segment each: short" in said
 
 
 def test_time_that_runs_backwards_is_told_and_left_out(model, tmp_path, capsys):

@@ -254,6 +254,7 @@ BAD = {
     "one axis": (npy(np.ones(6, np.float32)), r"shape \(6,\)"),
     "a video": (npy(np.ones((2, 5, 3), np.float32)), "one frame's"),
     "two columns": (npy(np.ones((5, 2), np.float32)), r"shape \(5, 2\)"),
+    "transposed": (npy(np.ones((3, 500), np.float32)), "send it transposed"),
     "objects": (npy(np.array([[None] * 3], object), allow_pickle=True), "object"),
     "complex": (npy(np.ones((5, 3), np.complex64)), "complex64"),
     "NaN": (npy(np.where(np.eye(5, 3), np.nan, GOOD)), "3 of 5 points NaN"),
@@ -278,7 +279,12 @@ def test_columns_that_are_not_read_are_told_once(capsys):
     wide = np.random.default_rng(0).random((5, 4)).astype(np.float32)
     found = through_a_pipe(npy(wide) * 2)
     np.testing.assert_array_equal(found, [wide[:, :3]] * 2)
-    assert capsys.readouterr().err.count("arrays of 4 columns; the first 3 are read, as x, y, z") == 1
+    said = capsys.readouterr().err
+    assert said.count("arrays of 4 columns; the first 3 are read, as x, y, z") == 1 and "transposed" not in said
+    through_a_pipe(npy(np.ones((3, 40), np.float32)) * 2)
+    assert (
+        capsys.readouterr().err.count("frame 0: 3 rows of 40 numbers; if the rows are x, y and z, send the array") == 1
+    )
 
 
 def test_a_growing_file_is_followed(tmp_path):

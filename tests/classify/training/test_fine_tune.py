@@ -137,6 +137,15 @@ def test_other_classes_go_on_from_a_model_with_its_own_network(videos, model, tm
     assert done.videos == (0 if videos == 1 else 2)
 
 
+def test_settings_are_held_against_the_model_s_network(model, tmp_path):
+    """Eight centroids are its own; as many as the preset quick has would not fit into 2 frames of 16 points."""
+    data = clouds(tmp_path / "c.h5", 1, names=("wave", "bow"))
+    given = Given("auto", sets={"epochs_dynamic": 0}, flags={"init": str(model), "epochs": 0, "points": 16})
+    assert load_model(train(str(data), str(tmp_path / "run"), given).weights)[1].config.points_per_frame == 16
+    with pytest.raises(UsageError, match="2 frames x 2 points = 4 are fewer than 8 centroids"):
+        train(str(tmp_path / "none.h5"), str(tmp_path / "x"), Given("auto", flags={"init": str(model), "points": 2}))
+
+
 def rows(network):
     """The tensors of a network's classifiers, each by class: (copies, classes, ...)."""
     state, count = network.state_dict(), network.config.num_classes

@@ -406,6 +406,37 @@ def test_one_class_and_absent_classes_are_named(tmp_path, make_sequence, capfd):
     assert "never recognized: round" in capfd.readouterr().err
 
 
+def test_what_can_not_be_judged_or_told_apart_is_said(tmp_path, make_sequence, capfd):
+    def write(name, labels, people=None, classes=("up", "down", "round")):
+        with CloudsWriter(tmp_path / f"{name}.h5", class_names=classes) as writer:
+            for i, label in enumerate(labels):
+                subject = people[i] if people else -1
+                writer.write(make_sequence(f"{i}", label=label, frames=4, split="train", subject=subject))
+        return tmp_path / f"{name}.h5"
+
+    words = ("classify", "train", *SMALL, "--epochs", 0, "--set", "epochs_dynamic=0")
+    uneven = write("uneven", [0] * 7 + [1, 2])
+    assert dpc(*words, uneven, "-o", tmp_path / "a", "--validation", "0.2") == 0
+    assert "none of them is of 2 of the 3 classes that were learned: down, round" in capfd.readouterr().out
+    assert dpc(*words, uneven, "-o", tmp_path / "b", "--validation", "0.01") == 0
+    assert "--validation 0.01: no class has so many videos" in capfd.readouterr().err
+    assert load_model(tmp_path / "b")[1].notes["validation"] == "none"
+    assert (
+        dpc(*words, write("person", [0, 0, 1, 1], [1, 1, 2, 2]), "-o", tmp_path / "c", "--validation", "subject") == 3
+    )
+    assert "--validation subject holds out all videos of the others" in capfd.readouterr().err
+    assert dpc(*words, uneven, "-o", tmp_path / "c", "--validation", "subject") == 2
+    assert "uneven.h5 doesn't say who is seen" in capfd.readouterr().err
+    with CloudsWriter(tmp_path / "held.h5", class_names=("up", "down")) as writer:
+        for i, label in enumerate((0, 1, 0, -1, -1)):
+            writer.write(make_sequence(f"{i}", label=label, frames=4, split="train" if i < 2 else "validation"))
+    assert dpc(*words, tmp_path / "held.h5", "-o", tmp_path / "e", "--validation", "split") == 0
+    assert "2 videos of the split 'validation' without a label, left out: 3, 4" in capfd.readouterr().err
+    twice = write("twice", [0, 0, 1, 2], classes=("up", "down", "up"))
+    assert dpc(*words, twice, "-o", tmp_path / "d", "--validation", "none") == 3
+    assert "class names repeat, such as 'up'" in capfd.readouterr().err and not (tmp_path / "d").exists()
+
+
 def test_a_pipe_can_t_be_shared(monkeypatch, capfd):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert dpc("classify", "train", "-", "-o", "nowhere") == 2

@@ -16,6 +16,7 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.descriptors import clip_descriptors
 from dpcli.classify.network.forest import Forest
 from dpcli.classify.network.layers import ClipLinear
+from dpcli.classify.network.sync_norm import has_synchronized_norms
 from dpcli.errors import UsageError
 
 _REACH = 3  # slots that a layer over time sees
@@ -59,7 +60,7 @@ class PointSlots(Backbone):
         voting = self._voting_members(clips[..., 3].amax((1, 2)).long() - 2)
         total = clips.new_zeros(len(clips), self.config.num_classes)
         for member, asked in zip(self.members, voting.T):
-            if asked.any():
+            if asked.any() or (self.training and has_synchronized_norms(member)):
                 which = asked.nonzero()[:, 0]
                 total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
         logits = torch.log(total.clamp(min=_LEAST) / voting.sum(1, keepdim=True))
@@ -149,11 +150,14 @@ class _Member(nn.Module):
         here = clips[..., 3].flatten().nonzero()[:, 0]
         known = self.points(torch.cat([clips[..., :3], clips[..., 4:]], -1).flatten(0, 2).index_select(0, here))
         values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)
-        values, count = values.view(*clips.shape[:3], -1), (clips[..., 3:4] > 0).sum(2).to(values)
+        values, count = values.view(*clips.shape[:3], known.shape[-1]), (clips[..., 3:4] > 0).sum(2).to(values)
         pooled = [values.sum(2) / count.clamp(min=1), values.amax(2), torch.log1p(count)]  # values are not below 0
         if self.course is not None:
             pooled.append(slot_quantiles(clips))
-        found = self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], -1) + self.position
+        found = (
+            self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], self.position.shape[-1])
+            + self.position
+        )
         for layer in self.over_time:
             found = found + layer(found)
         read = [found.mean(1), found.amax(1)]
