@@ -218,7 +218,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         lines += [(name.replace("_", " "), f"{value:.4g}") for name, value in found["metrics"].items()]
     source = f" from {found['source']}" if found["source"] else ""
     seed = "" if found["seed"] is None else f", seed {found['seed']}"
-    maker = "a program that does not say" if found["version"] is None else f"dpc {found['version']}"
+    maker = "another program" if found["version"] is None else f"dpc {found['version']}"
     return [*lines, ("made by", f"{maker}{source}{seed}")]
 
 
