@@ -41,6 +41,12 @@ _FRAME = re.compile(
     re.IGNORECASE,
 )
 
+_RECORDING = re.compile(
+    r"#?(sequence|seq|recording|record|rec|video|take|trial|session|run|clip|episode|scene|file)s?"
+    r"[ _.-]?(id|ids|no|nr|num|number|idx|index|name|#|№)?[.]?",
+    re.IGNORECASE,
+)
+
 
 def words_of(name: str) -> list[str]:
     """Returns the words of a column's name in small letters.
@@ -158,3 +164,12 @@ def find_frame_column(names: Sequence[str]) -> str | None:
     found = [name for name in names if _FRAME.fullmatch(name.strip())]
     plain = [name for name in found if name.strip().lower().startswith(("frame", "#frame"))] or found
     return plain[0] if len(plain) == 1 else None
+
+
+def find_recording_columns(names: Sequence[str]) -> list[str]:
+    """Returns the names that say they tell recordings apart.
+
+    >>> find_recording_columns(["frame", "Video", "x", "recording_id", "track"])
+    ['Video', 'recording_id']
+    """
+    return [name for name in names if _RECORDING.fullmatch(name.strip())]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.scans.frames_of_tables import FELL, JOINED, SINGLE, WRAPPED
-from dpcli.prepare.scans.tables import TableSequences
+from dpcli.prepare.scans.tables import MIXED, TableSequences
 from dpcli.store import CloudsReader
 
 RNG = np.random.default_rng(0)
@@ -174,6 +174,18 @@ def test_times_of_points_taken_for_frames_are_doubted(tmp_path):
     (sample,) = sequences(path, frame_column="timestamp")
     assert sample.notes == {SINGLE: 1}
     assert sequences(write(tmp_path / "b.csv", frames(0, 1, 2, 3, 4, 5)))[0].notes == {}
+
+
+def test_a_column_of_recordings_that_is_not_asked_for_is_named_where_frames_mix_them(tmp_path):
+    rows = [(word, *row) for number in range(3) for word in ("b", "a") for row in frames(number)]  # sorted by frames
+    path = write(tmp_path / "log.csv", rows, "Video,frame,x,y,z")
+    (sample,) = sequences(path)
+    assert sample.notes == {MIXED.format("Video"): 1} and sample.sequence.frame_offsets.tolist() == [0, 4, 8, 12]
+    assert [one.notes for one in sequences(path, sequence_column="Video")] == [{}, {}]
+    after = [("ab"[number > 1], *row) for number in range(4) for row in frames(number)]  # each frame of one recording
+    assert sequences(write(tmp_path / "c.csv", after, "Video,frame,x,y,z"))[0].notes == {}
+    tracked = [(row[1], *row) for number in range(3) for row in frames(number)]
+    assert sequences(write(tmp_path / "d.csv", tracked, "track,frame,x,y,z"))[0].notes == {}
 
 
 @pytest.mark.parametrize("name", ["Frame #", "frame no.", "#Frame", "frameNum", "scan_id"])
