@@ -173,3 +173,29 @@ def find_recording_columns(names: Sequence[str]) -> list[str]:
     ['Video', 'recording_id']
     """
     return [name for name in names if _RECORDING.fullmatch(name.strip())]
+
+
+def find_trios(names: Sequence[str]) -> dict[tuple[str, ...], list[str]]:
+    """Returns the columns of which three differ in one word only, x, y and z, by their other words, as of tables with several
+    points in a row.
+
+    >>> find_trios(["frame", "x2", "y2", "z2", "hand.X", "hand.Y", "hand.Z", "snr"])
+    {('2',): ['x2', 'y2', 'z2'], ('hand',): ['hand.X', 'hand.Y', 'hand.Z']}
+    """
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        words = words_of(name)
+        axes = [word for word in words if word in ("x", "y", "z")]
+        if len(axes) == 1:
+            found.setdefault(tuple(word for word in words if word != axes[0]), {})[axes[0]] = name
+    return {others: list(trio.values()) for others, trio in found.items() if len(trio) == 3}
+
+
+def find_further_points(unread: Sequence[str]) -> list[str]:
+    """Returns the first three columns, of those that were not read, that hold another point of the row; [] without.
+
+    >>> find_further_points(["x2", "y2", "z2"]), find_further_points(["acc_x", "acc_y", "acc_z"])
+    (['x2', 'y2', 'z2'], [])
+    """
+    trios = find_trios(unread).items()
+    return next((trio for others, trio in trios if all(w.isdecimal() or w in _ABOUT_POINTS for w in others)), [])

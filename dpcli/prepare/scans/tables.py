@@ -13,7 +13,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import find_recording_columns
+from dpcli.prepare.cloud_formats.column_names import find_further_points, find_recording_columns
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import read_text_table
@@ -31,6 +31,7 @@ TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
 MIXED = (
     "sequences whose frames mix the values of the column {0!r}; if it names the recordings, give --sequence-column {0}"
 )
+WIDE = "sequences of which one point of a row was read, {}; others were not, such as {}: write a row for each point"
 _FEW = 5  # frames of one point that may be true
 
 
@@ -145,7 +146,10 @@ class TableSequences(OwnScans):
         )
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
-        sample.notes |= {SINGLE: 1} if len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds) else {}
+        if further := find_further_points([name for name in loaded.unused if name not in self.keep]):
+            sample.notes |= {WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1}
+        elif len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds):
+            sample.notes |= {SINGLE: 1}
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
