@@ -217,7 +217,9 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     elif found["kind"] == "embedding":
         lines += [(name.replace("_", " "), f"{value:.4g}") for name, value in found["metrics"].items()]
     source = f" from {found['source']}" if found["source"] else ""
-    return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+    seed = "" if found["seed"] is None else f", seed {found['seed']}"
+    maker = "another program" if found["version"] is None else f"dpc {found['version']}"
+    return [*lines, ("made by", f"{maker}{source}{seed}")]
 
 
 def _count(name: str, count: int) -> str:

@@ -135,3 +135,15 @@ def test_a_file_of_another_program_may_have_more(tmp_path):
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file["theirs"] = np.ones(3)
     assert len(CloudsReader(tmp_path / "a.h5")) == 1
+
+
+def test_the_page_s_example_writes_a_file_of_tracks(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tracks = np.random.default_rng(0).normal(size=(4, 6, 3))
+    np.save("tracks.npy", tracks)
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    exec(example, {})
+    with CloudsReader("tracks.h5") as reader:
+        sequence = reader.read(0)
+    assert np.array_equal(sequence.points.reshape(4, 6, 3), tracks.astype(np.float32))
+    assert sequence.track.reshape(4, 6).tolist() == [[0, 1, 2, 3, 4, 5]] * 4

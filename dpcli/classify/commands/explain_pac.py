@@ -28,6 +28,7 @@ from dpcli.runtime.progress import Progress
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.whole_file import PICTURES
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
+from dpcli.store.clouds_reader import OPTIONAL
 from dpcli.store.file import PACKED
 
 
@@ -194,7 +195,8 @@ def write_clouds(path: Path, clouds: Sequence[ActivationCloud], *, rule: str, **
 
     options: CloudsWriter's. Raises UsageError when the file exists and `force` is off.
     """
-    fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(clouds[0].sequence, key) is not None]
+    first = clouds[0].sequence
+    fields = [*(key for key in OPTIONAL if first.value(key) is not None), *first.extra]
     with _ActivationWriter(path, fields=fields, **options) as writer:
         for cloud in clouds:
             writer.write(cloud.sequence)

@@ -92,7 +92,8 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
     if size and far is not None and in_units and not size / _OTHER_UNIT < far < size * _OTHER_UNIT:
         log.warn(
             f"{what}: half of the points lie within {far:.3g} of the middle, within {size:.3g} in what {model} learned from:"
-            " is the unit of length another one? The scores would be meaningless; `dpc prepare clouds --scale` converts one to the other"
+            " is the unit of length another one, or is the background still there? The scores would be meaningless; prepare the raw"
+            " data again, clouds with --scale, depth videos with --depth-scale or --background"
         )
     if far is None:
         return

@@ -83,7 +83,9 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
     if reader.class_names and reader.class_names != info.class_names:
         pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
-        why = "the model was trained for other classes"
+        why = (
+            f"the model was trained for other classes; `dpc classify train ... --init {model_name}` makes one for yours"
+        )
         if {*reader.class_names} <= {*info.class_names}:
             why = f"it has these classes at other places; {REORDER}"
         if not mine and index == len(reader.class_names):

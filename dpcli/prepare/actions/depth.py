@@ -59,6 +59,7 @@ _OTHER_PICTURES = re.compile(
     r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
+_CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz")  # points, not pictures
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
     " .svo2 .r3d .sens .xef .klg .dat .pkl".split()
@@ -393,11 +394,17 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         below = (name.lower() for _, _, files in walk_folders(path) for name in files if not is_hidden(name))
-        others = Counter(splitext(name)[1] for name in below if name.endswith(_FOREIGN))
-        seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+        there = Counter(splitext(name)[1] for name in below if name.endswith((*_FOREIGN, *_CLOUDS)))
+        seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(there.items()))
+        clouds = not any(suffix.endswith(_FOREIGN) for suffix in there)
+        advice = (
+            "`dpc prepare clouds` reads them"
+            if clouds
+            else "save their depth as 16-bit PNG, or as .npy (frames, height, width)"
+        )
         raise DataError(
             f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, .npz,"
             f" {', '.join(VIDEO_SUFFIXES)}, or recordings (.bag, .mcap, .db3)"
-            + (f"; found {seen}: save their depth as 16-bit PNG, or as .npy (frames, height, width)" if seen else "")
+            + (f"; found {seen}: {advice}" if seen else "")
         )
     return found

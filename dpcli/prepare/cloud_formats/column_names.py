@@ -41,6 +41,12 @@ _FRAME = re.compile(
     re.IGNORECASE,
 )
 
+_RECORDING = re.compile(
+    r"#?(sequence|seq|recording|record|rec|video|take|trial|session|run|clip|episode|scene|file)s?"
+    r"[ _.-]?(id|ids|no|nr|num|number|idx|index|name|#|№)?[.]?",
+    re.IGNORECASE,
+)
+
 
 def words_of(name: str) -> list[str]:
     """Returns the words of a column's name in small letters.
@@ -158,3 +164,38 @@ def find_frame_column(names: Sequence[str]) -> str | None:
     found = [name for name in names if _FRAME.fullmatch(name.strip())]
     plain = [name for name in found if name.strip().lower().startswith(("frame", "#frame"))] or found
     return plain[0] if len(plain) == 1 else None
+
+
+def find_recording_columns(names: Sequence[str]) -> list[str]:
+    """Returns the names that say they tell recordings apart.
+
+    >>> find_recording_columns(["frame", "Video", "x", "recording_id", "track"])
+    ['Video', 'recording_id']
+    """
+    return [name for name in names if _RECORDING.fullmatch(name.strip())]
+
+
+def find_trios(names: Sequence[str]) -> dict[tuple[str, ...], list[str]]:
+    """Returns the columns of which three differ in one word only, x, y and z, by their other words, as of tables with several
+    points in a row.
+
+    >>> find_trios(["frame", "x2", "y2", "z2", "hand.X", "hand.Y", "hand.Z", "snr"])
+    {('2',): ['x2', 'y2', 'z2'], ('hand',): ['hand.X', 'hand.Y', 'hand.Z']}
+    """
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        words = words_of(name)
+        axes = [word for word in words if word in ("x", "y", "z")]
+        if len(axes) == 1:
+            found.setdefault(tuple(word for word in words if word != axes[0]), {})[axes[0]] = name
+    return {others: list(trio.values()) for others, trio in found.items() if len(trio) == 3}
+
+
+def find_further_points(unread: Sequence[str]) -> list[str]:
+    """Returns the first three columns, of those that were not read, that hold another point of the row; [] without.
+
+    >>> find_further_points(["x2", "y2", "z2"]), find_further_points(["acc_x", "acc_y", "acc_z"])
+    (['x2', 'y2', 'z2'], [])
+    """
+    trios = find_trios(unread).items()
+    return next((trio for others, trio in trios if all(w.isdecimal() or w in _ABOUT_POINTS for w in others)), [])

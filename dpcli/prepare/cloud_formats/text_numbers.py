@@ -14,7 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
-from dpcli.prepare.cloud_formats.column_names import unit_of, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import find_trios, unit_of, unit_of_comments
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 from dpcli.text_files import decode_text
 
@@ -340,10 +340,12 @@ def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None)
 
 
 def _advice(words: list[str]) -> str:
-    """Returns what to do where columns tell angles instead of lengths, "" where they don't."""
+    """Returns what to do where columns tell angles instead of lengths, or several points; "" where they do neither."""
     known = {word.lower()[:3] for word in words}
     if {"lat", "lon"} <= known:
         return "; project latitudes and longitudes to meters first"
+    if len(find_trios(words)) > 1:
+        return "; a row holds one point: write a row for each of them"
     angles = known & {"azi", "ele", "the", "phi", "ang"}
     return (
         "; compute x, y and z of the angles and distances first"

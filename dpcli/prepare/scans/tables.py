@@ -13,6 +13,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.column_names import find_further_points, find_recording_columns
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import read_text_table
@@ -28,6 +29,10 @@ from dpcli.runtime.clips.other_files import stand_in
 from dpcli.store.schema import kept_names
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
+MIXED = (
+    "sequences whose frames mix the values of the column {0!r}; if it names the recordings, give --sequence-column {0}"
+)
+WIDE = "sequences of which one point of a row was read, {}; others were not, such as {}: write a row for each point"
 _FEW = 5  # frames of one point that may be true
 
 
@@ -150,7 +155,12 @@ class TableSequences(OwnScans):
         sample.notes |= (
             loaded.cloud.dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
         )
-        sample.notes |= {SINGLE: 1} if len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds) else {}
+        mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
+        sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
+        if further := find_further_points([name for name in loaded.unused if name not in self.keep]):
+            sample.notes |= {WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1}
+        elif len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds):
+            sample.notes |= {SINGLE: 1}
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
@@ -173,8 +183,8 @@ class TableSequences(OwnScans):
 
 @dataclass(frozen=True)
 class Loaded:
-    """Holds a table that was read: all its points, its sequences, the frame column, columns that were not asked for, and the
-    times that some of these tell.
+    """Holds a table that was read: all its points, its sequences, the frame column, columns that were not asked for, the
+    times that some of these tell, and the numbered values i64 (N) of those whose names say that they tell recordings apart.
     """
 
     cloud: Cloud
@@ -182,6 +192,12 @@ class Loaded:
     column: str
     unused: tuple[str, ...]
     clocks: list[Clock]
+    recordings: dict[str, np.ndarray]
+
+    def mixes(self, part: Rows, name: str) -> bool:
+        """Returns whether a frame of a sequence has several values of a column that tells recordings apart."""
+        values, starts = self.recordings[name][part.rows], part.offsets[:-1]
+        return bool((np.minimum.reduceat(values, starts) < np.maximum.reduceat(values, starts)).any())
 
     def times(self, part: Rows, fps: float | None) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (T): by the frame column or ``fps``, else by a clock; else None."""
@@ -226,7 +242,11 @@ def _load(
     cloud.track = name_rows(table, track) if track not in ("", ROWS) else None
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused, find_clocks(table, unused))
+    named = [] if sequences else find_recording_columns(unused)
+    recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
+    return Loaded(
+        cloud, split_rows(table, column, sequences, gap), column, unused, find_clocks(table, unused), recordings
+    )
 
 
 def _tables_below(folder: Path) -> Iterator[Path]:

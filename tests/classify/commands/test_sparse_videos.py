@@ -103,7 +103,7 @@ def streamed_and_cut(tmp_path, data, capsys):
     assert "another" not in capsys.readouterr().err
     assert dpc("classify", "predict", tmp_path / "millimeters.npy", *window, *model) == 0
     said = capsys.readouterr().err
-    assert "millimeters.npy: half of the points lie within" in said and "is the unit of length another one?" in said
+    assert "millimeters.npy: half of the points lie within" in said and "is the unit of length another one, or" in said
     assert dpc("classify", "predict", tmp_path / "bare.npy", *window, *model) == 3
     assert "frame 0: 3 numbers a point; the model reads 4: x, y, z, speed, in this order" in capsys.readouterr().err
     cut = tmp_path / "cut.csv"

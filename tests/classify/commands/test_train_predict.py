@@ -444,7 +444,7 @@ def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc_here, t
         writer.write(make_sequence("x", label=0, frames=6))
     wrong = dpc_here("classify", "predict", tmp_path / "other.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert wrong.returncode == 3 and b"'up'" in wrong.stderr and b"'left'" in wrong.stderr
-    assert b"trained for other classes" in wrong.stderr
+    assert b"trained for other classes; `dpc classify train" in wrong.stderr and b" --init " in wrong.stderr
     with CloudsWriter(tmp_path / "turned.h5", class_names=["right", "left"]) as writer:
         writer.write(make_sequence("x", label=0, frames=6))
     turned = dpc_here("classify", "predict", tmp_path / "turned.h5", "--model", run_folder, "-o", tmp_path / "s.h5")

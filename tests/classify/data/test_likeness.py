@@ -27,7 +27,7 @@ def told(capsys, frames, model="msraction3d-24", **changes):
 
 def test_a_shipped_network_tells_another_unit_and_few_points(capsys):
     assert told(capsys, body()) == "" == told(capsys, body(2.5)) and told(capsys, []) == ""
-    assert "is the unit of length another one?" in told(capsys, body(1000)) and "within 0.233" in told(
+    assert "is the unit of length another one, or" in told(capsys, body(1000)) and "within 0.233" in told(
         capsys, body(0.001)
     )
     assert "a frame has 20 points in the median, msraction3d-24 takes 2048: repeated" in told(capsys, body(points=20))

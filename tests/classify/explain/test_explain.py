@@ -37,6 +37,7 @@ from dpcli.classify.network_speed import body_like_clip
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.embedding import EmbeddingReader
+from dpcli.store.joints import no_joints
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
@@ -70,14 +71,19 @@ def model() -> Kinet:
     return network()
 
 
+FIELDS = ("part", "joint", "field_speed")
+
+
 def blobs(path: Path, videos: int = 6, labeled: bool = True) -> Path:
     rng = np.random.default_rng(0)
-    with CloudsWriter(path, class_names=NAMES if labeled else (), fields=["part"]) as writer:
+    with CloudsWriter(path, class_names=NAMES if labeled else (), fields=FIELDS) as writer:
         for i in range(videos):
             frames = [rng.normal(size=(40, 3)) * 0.3 + [0.1 * t * (i % 3), 0, 2] for t in range(5)]
             parts = [np.arange(40) % 3 for _ in frames]
             label = i % 3 if labeled else -1
-            writer.write(CloudSequence.from_frames(f"v{i}", frames, label=label, part=parts))
+            sequence = CloudSequence.from_frames(f"v{i}", frames, label=label, part=parts, joint=no_joints(5, 3))
+            sequence.extra["field_speed"] = np.arange(200, dtype=np.float32) + i
+            writer.write(sequence)
     return path
 
 
@@ -532,14 +538,15 @@ def test_pac_writes_clouds_pictures_and_animations(data, weights, tmp_path, monk
     )
     assert dpc(*words, "-o", out, "--picture", png, "--animation", gif, "--set", "frames=3") == 0
     with CloudsReader(out) as reader, h5py.File(out) as file:
-        assert reader.names == ["v0", "v2"] and reader.fields == ("part",) and reader.frame_counts.tolist() == [4, 4]
+        assert reader.names == ["v0", "v2"] and reader.fields == FIELDS and reader.frame_counts.tolist() == [4, 4]
         assert file["frame"][:].tolist() == [0, 1, 2, 3] * 2 and file["explained"][:].tolist() == [2, 2]
         for stream in ("static", "dynamic"):
             values = file["activation"][stream][:]
             assert values.dtype == np.float32 and len(values) == reader.num_points
             assert values.min() >= 0 and values.max() == 1
         source = CloudsReader(data).read(2, [0, 1, 2, 3])
-        np.testing.assert_array_equal(reader.read(1).points, source.points)
+        for name in ("points", *FIELDS):
+            np.testing.assert_array_equal(reader.read(1).value(name), source.value(name))
     with Image.open(png) as picture, Image.open(gif) as moving:
         assert picture.width > 3 * 130 and picture.height > 4 * 130 and moving.n_frames == 4
         assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 50

@@ -155,6 +155,12 @@ def test_files_that_are_not_read_are_named_where_nothing_else_is_there(tmp_path)
         read(tmp_path)
 
 
+def test_a_folder_of_point_clouds_is_sent_to_the_command_that_reads_them(tmp_path):
+    (tmp_path / "1.ply").write_text("ply\n")
+    with pytest.raises(DataError, match="found 1 .ply: `dpc prepare clouds` reads them"):
+        DepthVideos(inputs=(tmp_path,)).items()
+
+
 def test_a_frame_in_two_formats_is_one_frame(tmp_path):
     folder = write(tmp_path / "v", **{str(t): depth(1000 + t) for t in range(2)})
     for t in range(2):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.scans.frames_of_tables import FELL, JOINED, SINGLE, WRAPPED
-from dpcli.prepare.scans.tables import TableSequences
+from dpcli.prepare.scans.tables import MIXED, WIDE, TableSequences
 from dpcli.store import CloudsReader
 
 RNG = np.random.default_rng(0)
@@ -174,6 +174,30 @@ def test_times_of_points_taken_for_frames_are_doubted(tmp_path):
     (sample,) = sequences(path, frame_column="timestamp")
     assert sample.notes == {SINGLE: 1}
     assert sequences(write(tmp_path / "b.csv", frames(0, 1, 2, 3, 4, 5)))[0].notes == {}
+
+
+def test_a_column_of_recordings_that_is_not_asked_for_is_named_where_frames_mix_them(tmp_path):
+    rows = [(word, *row) for number in range(3) for word in ("b", "a") for row in frames(number)]  # sorted by frames
+    path = write(tmp_path / "log.csv", rows, "Video,frame,x,y,z")
+    (sample,) = sequences(path)
+    assert sample.notes == {MIXED.format("Video"): 1} and sample.sequence.frame_offsets.tolist() == [0, 4, 8, 12]
+    assert [one.notes for one in sequences(path, sequence_column="Video")] == [{}, {}]
+    after = [("ab"[number > 1], *row) for number in range(4) for row in frames(number)]  # each frame of one recording
+    assert sequences(write(tmp_path / "c.csv", after, "Video,frame,x,y,z"))[0].notes == {}
+    tracked = [(row[1], *row) for number in range(3) for row in frames(number)]
+    assert sequences(write(tmp_path / "d.csv", tracked, "track,frame,x,y,z"))[0].notes == {}
+
+
+def test_further_points_of_a_row_are_told(tmp_path):
+    rows = [(number, *range(9)) for number in range(8)]
+    wide = write(tmp_path / "a.csv", rows, "frame," + ",".join(f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"))
+    (sample,) = sequences(wide)
+    assert sample.notes == {WIDE.format("x1, y1, z1", "x2, y2, z2"): 1}
+    other = write(tmp_path / "b.csv", [(*row, *row) for row in frames(0, 1)], "frame,x,y,z,t,vel_x,vel_y,vel_z")
+    assert sequences(other)[0].notes == {}
+    named = write(tmp_path / "c.csv", [row[:7] for row in rows], "frame,hand.X,hand.Y,hand.Z,head.X,head.Y,head.Z")
+    (item,) = TableSequences(named).items()
+    assert "a row holds one point: write a row for each of them" in item.problem
 
 
 @pytest.mark.parametrize("name", ["Frame #", "frame no.", "#Frame", "frameNum", "scan_id"])
