@@ -21,6 +21,7 @@ from dpcli.prepare.scans.kitti_files import (
     check_coordinates,
     file_sizes,
     is_no_camera,
+    names_in,
     orient_points,
     read_calibration,
     read_velodyne,
@@ -63,7 +64,9 @@ def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
 def read_poses(path: Path) -> np.ndarray:
     """Reads poses.txt as f64 (scans,4,4): camera of each scan to the camera of scan 0."""
     try:
-        rows = [[float(word) for word in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()]
+        rows = [
+            [float(word) for word in line.split()] for line in path.read_text("utf-8-sig").splitlines() if line.strip()
+        ]
     except OSError:
         raise DataError(f"{path}: not found; --align needs it") from None
     except ValueError:
@@ -76,8 +79,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def _labels_without_scan(folder: Path) -> list[str]:
-    scans = {path.stem for path in (folder / "velodyne").glob("*.bin")}
-    return sorted({path.stem for path in (folder / "labels").glob("*.label")} - scans)
+    return sorted(set(names_in(folder / "labels", ".label")) - set(names_in(folder / "velodyne", ".bin")))
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ class SemanticKitti:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
         for sequence, folder in self._folders():
-            scans = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
+            scans = names_in(folder / "velodyne", ".bin")
             for start in range(0, len(scans) - self.frames + 1, self.frames):
                 window = scans[start : start + self.frames]
                 split = "validation" if sequence == VALIDATION else "train"
@@ -205,7 +207,7 @@ class SemanticKitti:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        held = sum(len(list((folder / "velodyne").glob("*.bin"))) for _, folder in self._folders())
+        held = sum(len(names_in(folder / "velodyne", ".bin")) for _, folder in self._folders())
         found = [name for name, _ in self._folders()]
         lines = [f"{counted(len(items), 'sample')} of {counted(self.frames, 'scan')}, sequences {', '.join(found)}"]
         missing = [name for name in GROUPS[self.group] if name not in found]
