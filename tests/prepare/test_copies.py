@@ -14,6 +14,7 @@ from dpcli.prepare.actions.shrec17 import Shrec17
 from dpcli.prepare.scans.kitti_det import KittiDetection
 from dpcli.prepare.scans.modelnet40 import CLASS_NAMES, ModelNet40
 from dpcli.prepare.scans.semantickitti import SemanticKitti
+from dpcli.prepare.views.given_views import find_views
 from tests.support.depth_png_helpers import hand_depth, ntu_files, person, write_files, write_gesture, write_lists
 from tests.support.kitti_helpers import P2, velodyne_to_camera, write_calibration, write_png, write_scan
 
@@ -115,3 +116,12 @@ def test_an_archive_of_macos_is_read_without_its_twins(tmp_path):
             archive.writestr(f"__MACOSX/{folder}/._{own}", b"\0\5\x16\7")
             archive.writestr(name, content)
     assert everything(NTU60((tmp_path / "ntu.zip",)), tmp_path) == everything(ntu60(tmp_path / "plain"), tmp_path)
+
+
+def test_folders_of_macos_are_no_views(tmp_path):
+    for view in range(6):
+        for frame in range(3):
+            write_png(tmp_path / f"view{view}" / f"{frame}.png", np.zeros((4, 4), np.uint8))
+    expected = find_views(tmp_path, None, [0, 1, 2], 3)
+    pack_twins(tmp_path)
+    assert find_views(tmp_path, None, [0, 1, 2], 3) == expected and len(expected) == 6

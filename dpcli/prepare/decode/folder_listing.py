@@ -69,7 +69,7 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
     while waiting:
         folder = waiting.pop()
         try:
-            entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
+            entries = [entry for entry in os.scandir(folder) if not is_hidden(entry.name)]
         except OSError as error:
             found.append((folder, f"cannot be listed ({error.strerror})"))
             continue
