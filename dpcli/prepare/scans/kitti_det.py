@@ -180,12 +180,15 @@ class KittiDetection:
                 f"{item.path / 'velodyne' / item.name}.bin: no point in the camera's view within "
                 f"{self.view.far} m; do scan and calibration belong together?"
             )
-        boxes = [b for b in read_boxes(item.path / "label_2" / f"{item.name}.txt") if b.kind in self.objects]
+        labeled = read_boxes(item.path / "label_2" / f"{item.name}.txt")
+        boxes = [box for box in labeled if box.kind in self.objects]
+        strange = [box.kind for box in labeled if box.kind not in TYPES]
         part = parts_of_boxes(points, boxes)
         notes = {
             OUTSIDE: len(scan) - len(points),
             "scans cropped to 1242x375, their image_2 is missing": int(size == IMAGE_SIZE and not image.is_file()),
             "scans without an object": int(not part.any()),
+            f"boxes left out whose type is none of KITTI's, such as {min(strange, default='')!r}": len(strange),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),
         }
         cloud = orient_points(points, self.coordinates)
