@@ -125,3 +125,11 @@ def test_folders_of_macos_are_no_views(tmp_path):
     expected = find_views(tmp_path, None, [0, 1, 2], 3)
     pack_twins(tmp_path)
     assert find_views(tmp_path, None, [0, 1, 2], 3) == expected and len(expected) == 6
+
+
+def test_an_archive_of_windows_has_other_slashes(tmp_path):
+    with zipfile.ZipFile(tmp_path / "ntu.zip", "w") as archive:
+        archive.writestr("nturgb+d_depth_masked\\", b"")
+        for name, content in ntu_files(NTU, person(0, 2)).items():
+            archive.writestr(name.replace("/", "\\"), content)
+    assert everything(NTU60((tmp_path / "ntu.zip",)), tmp_path) == everything(ntu60(tmp_path / "plain"), tmp_path)

@@ -45,8 +45,8 @@ def list_folders(path: Path) -> dict[str, ZipFolder]:
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
-                folder, _, name = info.filename.rpartition("/")
-                if not info.is_dir() and not is_hidden(name):
+                folder, _, name = _named(info).rpartition("/")
+                if name and not is_hidden(name):
                     found.setdefault(folder, []).append(info)
     except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError, ValueError, struct.error) as error:
         raise DataError(
@@ -60,7 +60,12 @@ def _folder(infos: list[zipfile.ZipInfo]) -> ZipFolder:
         (i.header_offset, i.compress_size, i.file_size, i.CRC, i.compress_type, i.flag_bits, _name_length(i))
         for i in infos
     ]
-    return ZipFolder(tuple(info.filename.rpartition("/")[2] for info in infos), np.array(rows, _ENTRY))
+    return ZipFolder(tuple(_named(info).rpartition("/")[2] for info in infos), np.array(rows, _ENTRY))
+
+
+def _named(info: zipfile.ZipInfo) -> str:
+    """Returns the name of an entry with forward slashes; some programs of Windows write others."""
+    return info.filename.replace("\\", "/")
 
 
 def _name_length(info: zipfile.ZipInfo) -> int:
