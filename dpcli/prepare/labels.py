@@ -121,9 +121,8 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     if len(below) == 1:
         (only,) = below
         advice = f"give {given / only}" if (given / only).is_dir() else f"move them up, out of {only!r}"
-        log.warn(
-            f"{root}: all samples are of one class, {top!r}; if the folders in {only!r} are the classes ({listed}), {advice}"
-        )
+        whose = "its folders" if only == top else f"the folders in {only!r}"
+        log.warn(f"{root}: all samples are of one class, {top!r}; if {whose} are the classes ({listed}), {advice}")
     else:
         log.warn(
             f"{root}: the classes are {first_names(sorted(below))}; the folders below are the same in each ({listed}): if those"
