@@ -103,6 +103,11 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     """Warns where folders of another level may be the classes: all samples lie below one folder, or the folders below each
     are the same. parts: of every name, from its class on.
     """
+    given, top = root, parts[0][0] if parts else ""
+    while len({*map(tuple, (own[:2] for own in parts))}) == 1 and all(len(own) > 2 for own in parts):
+        given, parts = given / parts[0][0], [own[1:] for own in parts]  # a folder that holds nothing but a folder
+    if len({own[0] for own in parts}) == 1 and all(len(own) > 3 and split_called(own[1]) for own in parts):
+        parts = [[own[0], *own[2:]] for own in parts]  # the classes may lie below the splits
     below: dict[str, set[str]] = {}
     people = all(re.fullmatch(r"\D*\d+", own[0]) for own in parts)  # s1/wave, s2/wave
     for own in parts:
@@ -115,9 +120,9 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
     listed = first_names(sorted(same))
     if len(below) == 1:
         (only,) = below
-        log.warn(
-            f"{root}: all samples are of one class, {only!r}; if its folders are the classes ({listed}), give {root / only}"
-        )
+        advice = f"give {given / only}" if (given / only).is_dir() else f"move them up, out of {only!r}"
+        whose = "its folders" if only == top else f"the folders in {only!r}"
+        log.warn(f"{root}: all samples are of one class, {top!r}; if {whose} are the classes ({listed}), {advice}")
     else:
         log.warn(
             f"{root}: the classes are {first_names(sorted(below))}; the folders below are the same in each ({listed}): if those"

@@ -28,6 +28,7 @@ from typing import Any
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.reader import require_folder
+from dpcli.prepare.series import is_hidden
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_toml
 
@@ -127,12 +128,16 @@ class Tree:
 
 
 def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
-    """Yields path and size of every file; follows links to folders, but none that lead back to where they came from."""
+    """Yields path and size of every file that isn't hidden; follows links to folders, but none that lead back to where they came
+    from.
+    """
     stack = [(folder, prefix, (folder.resolve(),))]
     while stack:
         here, before, parents = stack.pop()
         with os.scandir(here) as entries:
             for entry in entries:
+                if is_hidden(entry.name):
+                    continue
                 name = before + entry.name
                 try:
                     if entry.is_dir():

@@ -194,8 +194,10 @@ def _evenly(numbers: np.ndarray) -> np.ndarray:
 
 
 def is_hidden(name: str) -> bool:
-    """Returns whether a file is none of the user's: hidden, as what macOS puts beside a file (``._x``), or a lock."""
-    return name.startswith((".", "~$"))
+    """Returns whether a file or folder is none of the user's: hidden, as what macOS puts beside a file (``._x``) or packs into a
+    folder ``__MACOSX`` of an archive, or a lock.
+    """
+    return name.startswith((".", "~$")) or name == "__MACOSX"
 
 
 def is_beside(name: str) -> bool:

@@ -121,3 +121,31 @@ def test_a_line_that_tells_spreadsheets_the_divider_is_none_of_the_table(tmp_pat
     (tmp_path / "labels.csv").write_text(line + "name;label\na;wave\nb;\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"labels\.csv:4: 'b,'"):
         read_labels(tmp_path / "labels.csv")
+
+
+@pytest.mark.parametrize(
+    ("above", "hint"),
+    [
+        ("data", "give {root}/data"),
+        ("data/deep", "give {root}/data/deep"),
+        ("train/data", "move them up, out of 'data'"),
+    ],
+)
+def test_folders_above_the_classes_are_told(above, hint, tmp_path, capsys):
+    names = [f"{above}/{label}/{one}" for label in ("wave", "bow") for one in ("a", "b")]
+    names += [name.replace("train", "test") for name in names if "train" in name]
+    (tmp_path / "data/deep").mkdir(parents=True)
+    if "train" in above:
+        (tmp_path / "data/deep").rmdir()
+        (tmp_path / "data").rmdir()
+    labels_of_folders(tmp_path, names, "CLASS/VIDEO")
+    said = " ".join(capsys.readouterr().err.split())
+    assert "all samples are of one class, 'data'" in said and hint.format(root=tmp_path) in said
+
+
+def test_splits_between_one_folder_and_the_classes_are_told(tmp_path, capsys):
+    names = [f"data/{split}/{label}/{one}" for split in ("train", "test") for label in ("wave", "bow") for one in "ab"]
+    labels_of_folders(tmp_path, names, "CLASS/VIDEO")
+    assert "all samples are of one class, 'data'" in capsys.readouterr().err
+    labels_of_folders(tmp_path, [f"wave/{split}/{one}" for split in ("train", "test") for one in "ab"], "CLASS/VIDEO")
+    assert not capsys.readouterr().err

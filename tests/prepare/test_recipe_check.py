@@ -106,6 +106,15 @@ def test_one_of_two_rows_suffices(toy):
     assert faults(toy) == []
 
 
+def test_hidden_twins_of_macos_are_no_files(toy):
+    for path in [path for path in toy.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"")
+        twin = toy / "__MACOSX" / path.relative_to(toy)
+        twin.parent.mkdir(parents=True, exist_ok=True)
+        twin.write_bytes(b"")
+    assert not faults(toy)
+
+
 def test_links_in_a_circle_end(toy):
     (toy / "x" / "loop").symlink_to(toy)
     assert faults(toy) == []

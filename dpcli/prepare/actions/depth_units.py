@@ -46,7 +46,7 @@ def _marks(frames: np.ndarray) -> np.ndarray | None:
         largest = float(np.max(frames, initial=0))  # NaN, when there is one
         if largest < _MARKS_FLOAT[0] and float(np.min(frames, initial=0)) > -np.inf:
             return None
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             return ~np.isfinite(frames) | (frames > _TOO_LARGE) | np.isin(frames, np.array(_MARKS_FLOAT, kind))
     if kind.itemsize == 1:
         return None

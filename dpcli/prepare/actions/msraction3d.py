@@ -41,7 +41,10 @@ CLASS_NAMES = (
     "pick up and throw",
 )
 NAME = re.compile(r"a(\d{2})_s(\d{2})_e(\d{2})_sdepth\.(bin|mat)", re.IGNORECASE)
+_FOCAL = 280.0
 _SIZE = 240, 320  # rows and columns of the pictures
+_SMALLEST = 60  # rows of pictures that may be those of the data set, resized
+_RESIZED = "videos that are resized, not 320x240; --focal (280 by default) counts pixels of 320x240: give theirs"
 _LISTED = 8
 # (action, subject, trial) absent from the 567 published videos; trial 0 stands for all three
 ABSENT = (
@@ -126,7 +129,7 @@ class MSRAction3D:
     """Reads MSR-Action3D; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
 
     raw: Path
-    focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
+    focal: float = _FOCAL  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
     fields: ClassVar[tuple[str, ...]] = ()
@@ -190,6 +193,8 @@ class MSRAction3D:
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
+        if self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST:
+            notes |= {_RESIZED: 1}
         points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
         kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)

@@ -19,6 +19,7 @@ from dpcli.prepare.decode.folder_listing import folder_files, is_folder, leads_o
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.series import is_hidden
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
@@ -209,7 +210,7 @@ class NTU60:
         minutes.
         """
         with os.scandir(folder) as entries:
-            ordered = sorted(entries, key=lambda entry: entry.name)
+            ordered = sorted((one for one in entries if not is_hidden(one.name)), key=lambda entry: entry.name)
         strange = ""
         for entry in ordered:
             path = Path(entry.path)

@@ -21,6 +21,10 @@ from dpcli.text_files import read_text
 
 CLASSES = 25
 INTRINSICS = Intrinsics(224.502, 230.494, 160.0, 120.0)
+_SIZE, _FPS = (240, 320), 30.0  # rows and columns of the pictures, frames a second
+_SMALLEST = 100  # rows of pictures that may be those of the data set, resized
+_RESIZED = "clips whose video is resized, not 320x240; points are in its own pixels"
+_OTHER_RATE = "clips whose video isn't at 30 frames a second, in which the lists count; are they the right frames?"
 PUBLISHED = {"train": 1050, "test": 482}
 LINE = re.compile(
     r"path:(?P<path>\S.*?)\s+depth:(?P<stream>[^:\s]+):(?P<start>\d+):(?P<stop>\d+)(?:\s.*)?\slabel:(?P<label>\d+)\s*"
@@ -182,10 +186,14 @@ class NvGesture:
         clouds = [self._points(frame) for frame in frames]
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         kept, notes = drop_empty_frames(str(item.path), counts)
+        if frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
+            notes[_RESIZED] = 1
+        if rate and abs(rate - _FPS) > 1:
+            notes[_OTHER_RATE] = 1
         if len(frames) < stop - start:
             notes["frames listed beyond the end of a video"] = stop - start - len(frames)
         sequence = CloudSequence(
-            item.name, np.concatenate(clouds), offsets(counts[kept]), time=kept / (rate or 30.0), **describe(item)
+            item.name, np.concatenate(clouds), offsets(counts[kept]), time=kept / (rate or _FPS), **describe(item)
         )
         return Sample(sequence, notes)
 

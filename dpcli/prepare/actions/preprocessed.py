@@ -17,12 +17,20 @@ from dpcli.prepare.actions.pts_label import FILE as PTS_LABEL
 from dpcli.prepare.actions.pts_label import PtsLabel
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
+from dpcli.prepare.median import median
 from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
 
 KEYS = {"msraction3d": "point_clouds", "ntu60": "data"}  # what MeteorNet's and PSTNet's scripts call the array
+_NO_SHARE = 0.5  # units of the output of this many and more stored units are 33 m where these are shares of 65535 mm
+_SAMPLED = 4096  # points that are looked at
 _MSR = re.compile(r"(a(\d{2})_s(\d{2})_e(\d{2}))(?:\D.*)?\.npz", re.IGNORECASE)
 _NTU = re.compile(r"(S\d{3}C\d{3}P\d{3}R\d{3}A\d{3})(?:\D.*)?\.npz")
+_PLAUSIBLE = (0.05, 100.0)  # median distances in units of the output: some of half a meter, before one depth camera
+_STORED = {  # by default, and what other scripts store with the scale that fits (stored units at most, scale, what they are)
+    "msraction3d": ("at some hundreds of raw depth units", ((20.0, 1.0, "divided already"),)),
+    "ntu60": ("at shares of 65535 mm, below 1", ((20.0, 0.65535, "meters"), (20_000.0, 655.35, "millimeters"))),
+}
 _FORMS = ("auto", "msraction3d", "ntu60", "pts_label")
 
 
@@ -94,6 +102,8 @@ class PeerClouds:
         """Returns the name of the output's unit of length."""
         if self.form == "msraction3d":
             return f"{self._scale:g} raw depth units" if self._scale != 1 else "raw depth unit"
+        if self._scale >= _NO_SHARE:
+            return f"{self._scale:g} stored units"
         return f"{self._scale * 65535:g} mm"
 
     @property
@@ -150,7 +160,22 @@ class PeerClouds:
         counts = np.array([len(frame) for frame in frames], np.int64)
         kept, notes = drop_empty_frames(str(item.path), counts)
         points = np.concatenate(frames) * np.float32(1 / self._scale)
+        notes |= self._doubts(points)
         return Sample(CloudSequence(item.name, points, offsets(counts[kept]), **describe(item)), notes)
+
+    def _doubts(self, points: np.ndarray) -> dict[str, int]:
+        """Returns a note where points f32 (P,3) are, by the usual scale, where no depth camera sees any; it names what may fit."""
+        distances = np.linalg.norm(points[:: max(1, len(points) // _SAMPLED)], axis=1)
+        typical = float(median(distances)) if len(distances) else _PLAUSIBLE[0]
+        if self.scale is not None or _PLAUSIBLE[0] <= typical <= _PLAUSIBLE[1] or not np.isfinite(typical):
+            return {}
+        expected, others = _STORED[self.form]
+        stored = typical * self._scale
+        fits = next(
+            (f"if they are {what}, give --scale {scale:g}" for most, scale, what in others if stored <= most),
+            "see --scale",
+        )
+        return {f"videos whose points aren't where the scripts of {self.form} put them ({expected}); {fits}": 1}
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

@@ -28,7 +28,7 @@ TICKS_PER_SECOND = 1e7  # of the timestamps in general_informations.txt
 def read_regions(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Reads general_informations.txt: timestamps f64 (T) in ticks, hand regions i64 (T,4): x, y, width, height."""
     try:
-        lines = path.read_text(errors="replace").splitlines()
+        lines = path.read_text("utf-8-sig", "replace").splitlines()
     except FileNotFoundError:
         raise DataError(f"{path}: not found; it holds the hand's region (--no-bbox does without)") from None
     rows = []

@@ -151,5 +151,5 @@ class MultiBodySync:
         """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in SPLITS}
         lines = [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
-        left = sorted({path.stem for path in (self.raw / "data").glob("*.npz")} - {item.name for item in items})
+        left = sorted({path.stem for path in (self.raw / "data").glob("[!.]*.npz")} - {item.name for item in items})
         return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])

@@ -98,7 +98,7 @@ def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
         (name, split)
         for key, split in _SPLITS.items()
         if (data / f"{key}.lst").is_file()
-        for name in (data / f"{key}.lst").read_text("utf-8", "replace").split()
+        for name in (data / f"{key}.lst").read_text("utf-8-sig", "replace").split()
     ]
     if not rooms:
         raise DataError(

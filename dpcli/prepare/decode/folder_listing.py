@@ -44,13 +44,13 @@ def _leads_above(path: str) -> bool:
 
 
 def folder_files(folder: Path, root: Path, suffix: str) -> Iterator[tuple[str, Path]]:
-    """Yields (name, path) of the files in a folder that end in ``suffix``, in no order.
+    """Yields (name, path) of the files in a folder that end in ``suffix`` and aren't hidden, in no order.
 
     Raises DataError at a link out of ``root``.
     """
     with os.scandir(folder) as entries:
         for entry in entries:
-            if not entry.name.lower().endswith(suffix):
+            if not entry.name.lower().endswith(suffix) or is_hidden(entry.name):
                 continue
             if entry.is_symlink() and (target := leads_out(Path(entry.path), root)):
                 raise DataError(f"{entry.path}: a link that leads out of the data, to {target}; copy the file here")
@@ -69,7 +69,7 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
     while waiting:
         folder = waiting.pop()
         try:
-            entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
+            entries = [entry for entry in os.scandir(folder) if not is_hidden(entry.name)]
         except OSError as error:
             found.append((folder, f"cannot be listed ({error.strerror})"))
             continue

@@ -14,6 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import require_distinct
+from dpcli.prepare.series import is_hidden
 
 # the header in front of a file's own bytes: signature, lengths of name and extra field
 _LOCAL = struct.Struct("<4s22x2H")
@@ -35,7 +36,8 @@ class ZipFolder:
 
 
 def list_folders(path: Path) -> dict[str, ZipFolder]:
-    """Returns every folder of an archive that directly holds files, by its name with forward slashes, "" for the top.
+    """Returns every folder of an archive that directly holds files, by its name with forward slashes, "" for the top; files that
+    are hidden, such as what macOS packs beside every file, are passed over.
 
     Raises DataError when the archive is no ZIP, cut short or damaged.
     """
@@ -43,8 +45,9 @@ def list_folders(path: Path) -> dict[str, ZipFolder]:
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
-                if not info.is_dir():
-                    found.setdefault(info.filename.rpartition("/")[0], []).append(info)
+                folder, _, name = _named(info).rpartition("/")
+                if name and not is_hidden(name):
+                    found.setdefault(folder, []).append(info)
     except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError, ValueError, struct.error) as error:
         raise DataError(
             f"{path}: no ZIP, or cut short, or its directory is damaged ({error or type(error).__name__}); copy it again"
@@ -57,7 +60,12 @@ def _folder(infos: list[zipfile.ZipInfo]) -> ZipFolder:
         (i.header_offset, i.compress_size, i.file_size, i.CRC, i.compress_type, i.flag_bits, _name_length(i))
         for i in infos
     ]
-    return ZipFolder(tuple(info.filename.rpartition("/")[2] for info in infos), np.array(rows, _ENTRY))
+    return ZipFolder(tuple(_named(info).rpartition("/")[2] for info in infos), np.array(rows, _ENTRY))
+
+
+def _named(info: zipfile.ZipInfo) -> str:
+    """Returns the name of an entry with forward slashes; some programs of Windows write others."""
+    return info.filename.replace("\\", "/")
 
 
 def _name_length(info: zipfile.ZipInfo) -> int:

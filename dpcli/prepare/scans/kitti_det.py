@@ -20,6 +20,7 @@ from dpcli.prepare.scans.kitti_files import (
     check_coordinates,
     file_sizes,
     missing_files_problem,
+    names_in,
     orient_points,
     read_calibration,
     read_velodyne,
@@ -63,7 +64,7 @@ def read_boxes(path: Path) -> list[Box]:
     DataError names the line that is not one.
     """
     boxes = []
-    for number, line in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
+    for number, line in enumerate(path.read_text("utf-8-sig", "replace").splitlines(), 1):
         words = line.split()
         if not words or words[0] == "DontCare":
             continue
@@ -97,7 +98,7 @@ def read_lists(folder: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for key, split in _SPLITS.items():
         path = folder / f"{key}.txt"
-        for name in path.read_text("utf-8", "replace").split() if path.is_file() else []:
+        for name in path.read_text("utf-8-sig", "replace").split() if path.is_file() else []:
             if not (name.isdecimal() and len(name) == 6):
                 raise DataError(f"{path}: holds {name[:40]!r}; expected six digits a line, such as 000123")
             if name in found:
@@ -138,7 +139,7 @@ class KittiDetection:
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder, split = training_folder(self.raw, "velodyne"), self._split()
-        names = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
+        names = names_in(folder / "velodyne", ".bin")
         if not names:
             raise DataError(f"{folder / 'velodyne'}: no 000000.bin ...; expected the scans of the training set")
         present = set(names)
@@ -179,12 +180,15 @@ class KittiDetection:
                 f"{item.path / 'velodyne' / item.name}.bin: no point in the camera's view within "
                 f"{self.view.far} m; do scan and calibration belong together?"
             )
-        boxes = [b for b in read_boxes(item.path / "label_2" / f"{item.name}.txt") if b.kind in self.objects]
+        labeled = read_boxes(item.path / "label_2" / f"{item.name}.txt")
+        boxes = [box for box in labeled if box.kind in self.objects]
+        strange = [box.kind for box in labeled if box.kind not in TYPES]
         part = parts_of_boxes(points, boxes)
         notes = {
             OUTSIDE: len(scan) - len(points),
             "scans cropped to 1242x375, their image_2 is missing": int(size == IMAGE_SIZE and not image.is_file()),
             "scans without an object": int(not part.any()),
+            f"boxes left out whose type is none of KITTI's, such as {min(strange, default='')!r}": len(strange),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),
         }
         cloud = orient_points(points, self.coordinates)

@@ -12,6 +12,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.reader import require_folder
+from dpcli.prepare.series import is_hidden
 
 OUTSIDE = "points outside the camera's view, --near and --far dropped"
 _SHORTEST_FOCAL = 10.0  # pixels; less is no camera but a matrix that somebody had to fill in
@@ -44,6 +45,13 @@ def training_folder(raw: Path, holds: str) -> Path:
     raise DataError(f"{raw}: no training/{holds}/ in it; expected the folders of KITTI's archives, unpacked together")
 
 
+def names_in(folder: Path, ending: str) -> list[str]:
+    """Returns the names of the files directly in a folder that end so, sorted, without the ending; hidden ones, such as what macOS
+    packs beside every file, are passed over.
+    """
+    return sorted(path.name.removesuffix(ending) for path in folder.glob(f"*{ending}") if not is_hidden(path.name))
+
+
 def missing_files_problem(paths: list[Path]) -> str:
     """Returns the problem of an item whose files are not all there; "" when they are."""
     missing = [path for path in paths if not path.is_file()]
@@ -59,7 +67,7 @@ def file_sizes(paths: list[Path]) -> dict[str, list[int]]:
 def read_calibration(path: Path) -> dict[str, np.ndarray]:
     """Reads ``KEY: numbers`` lines as f64 arrays; lines that hold no numbers, such as calib_time, are passed over."""
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise DataError(f"{path}: not text; expected lines such as 'P2: 7.215377e+02 0.0 ...'") from None
     found = {}

@@ -16,6 +16,7 @@ from dpcli.prepare.scans.kitti_files import (
     check_coordinates,
     file_sizes,
     missing_files_problem,
+    names_in,
     orient_points,
     read_calibration,
     read_png,
@@ -123,7 +124,7 @@ class KittiSceneFlow:
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder = training_folder(self.raw, "flow_occ")
-        names = sorted(path.name[:-7] for path in (folder / "flow_occ").glob("*_10.png"))
+        names = names_in(folder / "flow_occ", "_10.png")
         if not names:
             raise DataError(
                 f"{folder / 'flow_occ'}: no 000000_10.png ...; expected the 200 flow maps of the training set"

@@ -110,7 +110,7 @@ class ModelNet40:
         path = self.raw / "shape_names.txt"
         if not path.is_file():
             return list(CLASS_NAMES)
-        names = path.read_text(errors="replace").split()
+        names = path.read_text("utf-8-sig", "replace").split()
         if len(names) != len(CLASS_NAMES) or len(set(names)) != len(names):
             raise DataError(f"{path}: {len(names)} names, {len(set(names))} of them different; expected 40")
         return names
@@ -169,7 +169,7 @@ class ModelNet40:
         """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         lines = [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
-        files = (path.name for path in self.raw.iterdir() if path.suffix.lower() in (".h5", ".hdf5"))
+        files = (path.name for path in self.raw.glob("[!.]*") if path.suffix.lower() in (".h5", ".hdf5"))
         left = sorted(name for name in files if not _FILE.fullmatch(name))
         return lines + ([f"not read, not called ply_data_train0.h5 or the like: {first_names(left)}"] if left else [])
 
@@ -188,5 +188,5 @@ def _listed(path: Path) -> set[str] | None:
     """
     if not path.is_file():
         return None
-    lines = path.read_text(errors="replace").split("\n")
+    lines = path.read_text("utf-8-sig", "replace").split("\n")
     return {line.strip().replace("\\", "/").rpartition("/")[2] for line in lines if line.strip()}

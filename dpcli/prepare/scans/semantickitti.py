@@ -21,6 +21,7 @@ from dpcli.prepare.scans.kitti_files import (
     check_coordinates,
     file_sizes,
     is_no_camera,
+    names_in,
     orient_points,
     read_calibration,
     read_velodyne,
@@ -42,10 +43,16 @@ CLASSES = {
     "bicyclist": (31, 253),
     "motorcyclist": (32, 255),
 }
+_OTHER_CLASSES = (0, 1, 40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99)  # ground, buildings, plants, ...
 LABELED = tuple(f"{number:02}" for number in range(11))
 GROUPS = {"all": LABELED, "without-08": tuple(s for s in LABELED if s != "08"), "only-08": ("08",)}
 VALIDATION = "08"
 _WHOLE = "scans kept whole, because P2 in calib.txt is no camera's (focal length below 10 pixels)"
+_KNOWN = np.isin(np.arange(1 << 16), [*_OTHER_CLASSES, *(number for own in CLASSES.values() for number in own)])
+_REMAPPED = (
+    "scans with classes that SemanticKITTI doesn't have, as where labels were renumbered for training; objects are found by its"
+    " own numbers (car 10, truck 18, ...)"
+)
 
 
 def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +70,9 @@ def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
 def read_poses(path: Path) -> np.ndarray:
     """Reads poses.txt as f64 (scans,4,4): camera of each scan to the camera of scan 0."""
     try:
-        rows = [[float(word) for word in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()]
+        rows = [
+            [float(word) for word in line.split()] for line in path.read_text("utf-8-sig").splitlines() if line.strip()
+        ]
     except OSError:
         raise DataError(f"{path}: not found; --align needs it") from None
     except ValueError:
@@ -76,8 +85,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def _labels_without_scan(folder: Path) -> list[str]:
-    scans = {path.stem for path in (folder / "velodyne").glob("*.bin")}
-    return sorted({path.stem for path in (folder / "labels").glob("*.label")} - scans)
+    return sorted(set(names_in(folder / "labels", ".label")) - set(names_in(folder / "velodyne", ".bin")))
 
 
 @dataclass(frozen=True)
@@ -130,7 +138,7 @@ class SemanticKitti:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
         for sequence, folder in self._folders():
-            scans = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
+            scans = names_in(folder / "velodyne", ".bin")
             for start in range(0, len(scans) - self.frames + 1, self.frames):
                 window = scans[start : start + self.frames]
                 split = "validation" if sequence == VALIDATION else "train"
@@ -161,13 +169,14 @@ class SemanticKitti:
         to_camera, projection = (calibration_matrix(found, path, key) for key in ("Tr", "P2"))
         whole = is_no_camera(projection)
         kept = [self._scan(item.path, name, to_camera, None if whole else projection) for name in item.extra["scans"]]
-        notes = {_WHOLE: len(kept)} if whole else {OUTSIDE: sum(dropped for _, _, dropped in kept)}
+        notes = {_WHOLE: len(kept)} if whole else {OUTSIDE: sum(dropped for _, _, dropped, _ in kept)}
+        notes[_REMAPPED] = sum(strange for _, _, _, strange in kept)
         motions = self._alignment(item)
-        moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _), m in zip(kept, motions, strict=True)]
+        moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _, _), m in zip(kept, motions, strict=True)]
         clouds = [orient_points(to_camera_axes(points) if whole else points, self.coordinates) for points in moved]
-        sizes = np.cumsum([len(ids) for _, ids, _ in kept])[:-1]
+        sizes = np.cumsum([len(ids) for _, ids, _, _ in kept])[:-1]
         # over all frames: an object keeps its number
-        part = renumber_objects(np.concatenate([ids for _, ids, _ in kept]))
+        part = renumber_objects(np.concatenate([ids for _, ids, _, _ in kept]))
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
@@ -176,18 +185,20 @@ class SemanticKitti:
 
     def _scan(
         self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns points in camera axes f64 (M,3), object ids i64 (M), 0 = background, and how many points were dropped.
+    ) -> tuple[np.ndarray, np.ndarray, int, bool]:
+        """Returns points in camera axes f64 (M,3), object ids i64 (M), 0 = background, how many points were dropped, and whether
+        there are classes that SemanticKITTI doesn't have.
 
         Without a projection all points are kept, where ``to_camera`` puts them.
         """
         scan = read_velodyne(folder / "velodyne" / f"{name}.bin")
         semantic, label = read_labels(folder / "labels" / f"{name}.label", len(scan))
+        strange = not _KNOWN[semantic].all()
         label[~np.isin(semantic, [number for kind in self.objects for number in CLASSES[kind]])] = 0
         if projection is None:
-            return scan.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3], label, 0
+            return scan.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3], label, 0, strange
         points, index = self.view.crop(scan, to_camera, projection, IMAGE_SIZE)
-        return points, label[index], len(scan) - len(index)
+        return points, label[index], len(scan) - len(index), strange
 
     def _alignment(self, item: Item) -> np.ndarray:
         """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities
@@ -205,7 +216,7 @@ class SemanticKitti:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        held = sum(len(list((folder / "velodyne").glob("*.bin"))) for _, folder in self._folders())
+        held = sum(len(names_in(folder / "velodyne", ".bin")) for _, folder in self._folders())
         found = [name for name, _ in self._folders()]
         lines = [f"{counted(len(items), 'sample')} of {counted(self.frames, 'scan')}, sequences {', '.join(found)}"]
         missing = [name for name in GROUPS[self.group] if name not in found]

@@ -15,6 +15,7 @@ from dpcli.errors import DataError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS
 from dpcli.prepare.decode.color_frames import frame_numbers, image_paths
 from dpcli.prepare.reader import natural_key, require_folder
+from dpcli.prepare.series import is_hidden
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
@@ -83,7 +84,7 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
     Layouts: FOLDER/FRAME/VIEW.png (STAG4D) or FOLDER/VIEW/FRAME.png. cameras None: six views of STAG4D.
     """
     require_folder(folder, "a folder per frame with one picture per view, or a folder per view")
-    inner = sorted((p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")), key=natural_key)
+    inner = sorted((p for p in folder.iterdir() if p.is_dir() and not is_hidden(p.name)), key=natural_key)
     if not inner:
         raise DataError(
             f"{folder}: no folders inside; expected FRAME/VIEW.png (such as 0_rgba/0.png) or VIEW/FRAME.png"

@@ -285,3 +285,13 @@ def test_folders_that_are_none(tmp_path):
         MSRAction3D(tmp_path / "file").items()
     with pytest.raises(UsageError, match="positive"):
         MSRAction3D(tmp_path, focal=0)
+
+
+@pytest.mark.parametrize(("height", "width"), [(240, 320), (120, 160), (480, 640), (240, 240)])
+def test_resized_pictures_need_a_focal_length_of_their_own(tmp_path, height, width):
+    write_msr(tmp_path, ["a01_s01_e01"], frames=1, height=height, width=width)
+    notes = {}
+    for focal in (280.0, 140.0):
+        reader = MSRAction3D(tmp_path, focal=focal)
+        notes[focal] = " ".join(reader.read(reader.items()[0], RNG).notes)
+    assert ("resized, not 320x240" in notes[280.0]) == ((height, width) != (240, 320)) and not notes[140.0]

@@ -216,3 +216,17 @@ def test_real_videos(shared_data):
     sample = reader.read(items[0], RNG)
     assert sample.sequence.num_frames == 80
     assert sample.sequence.points.min() >= 0 and sample.sequence.points.max() < 320
+
+
+@pytest.mark.parametrize(
+    ("shape", "fps", "told"),
+    [((240, 320), 30.0, ""), ((120, 160), 30.0, "not 320x240"), ((240, 320), 15.0, "isn't at 30 frames a second")],
+)
+def test_videos_that_were_encoded_again_are_told(tmp_path, shape, fps, told):
+    reader = NvGesture(make_raw(tmp_path, [line()]))
+    item = reader.items()[0]
+    video = np.zeros((8, *shape), np.uint8)
+    video[:, 20:60, 20:80] = 150
+    write_video(item.path, video, fps=fps)
+    notes = reader.read(item, RNG).notes
+    assert [told in note for note in notes] == [True] * bool(told)

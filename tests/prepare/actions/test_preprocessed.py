@@ -394,3 +394,29 @@ def test_recipes_agree_with_the_readers():
     assert ntu["checks"]["videos"] == ntu["expect"]["sequences"] == ntu60.VIDEOS
     assert {k: shapes["split"][k] for k in ("train", "test")} == modelnet40.PUBLISHED
     assert shapes["expect"]["sequences"] == sum(modelnet40.PUBLISHED.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "stored", "scale", "unit"),
+    [
+        (MSR, "point_clouds", 1 / 300, 1.0, "raw depth unit"),  # divided already
+        (NTU, "data", 1.0, 655.35, "655.35 stored units"),  # millimeters
+        (NTU, "data", 1e-3, 0.65535, "0.65535 stored units"),  # meters
+    ],
+)
+def test_clouds_in_other_units_are_told_with_the_scale_that_fits(tmp_path, name, key, stored, scale, unit):
+    form, usual, far = ("msraction3d", 1.0, 600) if name == MSR else ("ntu60", 1 / 65535, 3000)
+    frame = np.array([[100.0, 20, far], [120, 30, far + 40]])
+    clouds = {}
+    for place, factor in (("usual", usual), ("other", stored)):
+        (tmp_path / place).mkdir()
+        np.savez(tmp_path / place / f"{name}.npz", **{key: np.stack([frame * factor, frame * factor])})
+        reader = open_preprocessed(tmp_path / place)
+        sample = reader.read(reader.items()[0], RNG)
+        clouds[place] = sample.sequence.points
+        told = " ".join(sample.notes)
+        assert (f"give --scale {scale:g}" in told) == (place == "other"), told
+    reader = open_preprocessed(tmp_path / "other", scale=scale)
+    sample = reader.read(reader.items()[0], RNG)
+    np.testing.assert_allclose(sample.sequence.points, clouds["usual"], rtol=1e-5)
+    assert not sample.notes and reader.length_unit == unit

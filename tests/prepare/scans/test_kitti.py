@@ -315,6 +315,16 @@ def test_detection_labels_what_the_boxes_hold(tmp_path):
     np.testing.assert_array_equal(vans, np.repeat([1, 3, 0, 0, 2], 40))
 
 
+@pytest.mark.parametrize("kind", ["car", "Vehicle", "Bus"])
+def test_boxes_of_types_that_kitti_lacks_are_told(tmp_path, kind):
+    write_detection(tmp_path)
+    path = tmp_path / "training" / "label_2" / "000003.txt"
+    path.write_text(path.read_text().replace("Car", kind, 1))
+    reader = KittiDetection(tmp_path)
+    notes = reader.read(reader.items()[0], None).notes
+    assert notes == {f"boxes left out whose type is none of KITTI's, such as '{kind}'": 1}
+
+
 def brute_force_crop(scan, to_camera, projection, size, near=2.0, far=35.0):
     kept = []
     for k, (x, y, z) in enumerate(scan.astype(float)):

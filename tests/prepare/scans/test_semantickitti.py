@@ -75,6 +75,16 @@ def test_objects_are_instances(tmp_path):
     np.testing.assert_allclose(camera.points, sequence.points * [-1, -1, 1])
 
 
+@pytest.mark.parametrize("strange", [4, 9, 17, 19, 260, 65535])
+def test_labels_renumbered_for_training_are_told(tmp_path, strange):
+    """Their 10 and 18 are parking places and poles, and would be taken for cars and trucks."""
+    labels = {"000000": [label(strange), *LABELS[1:]], "000001": LABELS}
+    write_scans(sequences(tmp_path) / "00", {name: visible(7) for name in labels}, labels)
+    reader = SemanticKitti(tmp_path)
+    told = [" ".join(reader.read(item, None).notes) for item in reader.items()]
+    assert ["classes that SemanticKITTI doesn't have" in one for one in told] == [True, False]
+
+
 def test_labels_are_two_halves(tmp_path):
     (tmp_path / "a.label").write_bytes(bytes([0x0A, 0x00, 0x02, 0x01, 0xFC, 0x00, 0x00, 0x00]))  # little-endian
     semantic, full = read_labels(tmp_path / "a.label", 2)
