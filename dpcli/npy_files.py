@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -54,12 +55,20 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         return {one.filename[: -len(".npy")]: read_member(path, archive.read(one)) for one in members}
 
 
+def read_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Returns the shape of an array, whether it is in Fortran's order, and its type, from the head of a `.npy`.
+
+    The stream stands behind the head then. A damaged one raises nearly anything.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(stream)
+
+
 def read_member(path: Path, data: bytes) -> np.ndarray:
     """Returns the array that the bytes of a `.npy` describe. Raises DataError where its header claims another size."""
     stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = header(stream)
+    shape, _, dtype = read_header(stream)
     claimed, held = prod(shape) * dtype.itemsize, len(data) - stream.tell()
     if not dtype.hasobject and (claimed != held or min(shape, default=0) < 0):
         raise DataError(

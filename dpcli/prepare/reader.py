@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -48,6 +49,12 @@ class Sample:
 
     sequence: CloudSequence
     notes: dict[str, int] = field(default_factory=dict)
+
+
+def published_found(items: Sequence[Item], published: Mapping[str, int], kind: str) -> list[str]:
+    """Returns a line for each published split: how many of its samples, `kind` in the plural, the index holds."""
+    found = Counter(item.split for item in items if not item.problem)
+    return [f"{split}: {found[split]} of the {count} published {kind} found" for split, count in published.items()]
 
 
 def split_called(word: str) -> str:

@@ -24,6 +24,7 @@ from dpcli.reproduce.runs import (
     markdown,
     numbers,
     override,
+    refuse_unknown,
     samples,
     shares,
     some,
@@ -298,9 +299,7 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     only = given.only.replace(" ", ",").split(",") if given.only else known
     first = {None: experiment.first, "none": ""}.get(given.first, given.first)
     for option, keys in (("--only", only), ("--from", [first] if first else [])):
-        unknown = [key for key in keys if key not in known]
-        if unknown:
-            parser.error(f"{option}: no setting {unknown[0]!r}; there are {', '.join(known)}")
+        refuse_unknown(parser, option, "setting", keys, known)
     if first and not experiment.first:
         parser.error(f"--from: the settings of table {experiment.number} don't go on from one another")
     needed = list(dict.fromkeys(one.data for one in experiment.settings if one.key in only))

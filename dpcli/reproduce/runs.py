@@ -6,6 +6,7 @@ over as long as it would be made from the same data by the same words.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
@@ -13,7 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
@@ -190,6 +191,15 @@ def cut(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
     words = list(sys.argv[1:] if argv is None else argv)
     where = words.index("--") if "--" in words else len(words)
     return words[:where], words[where + 1 :]
+
+
+def refuse_unknown(
+    parser: argparse.ArgumentParser, option: str, kind: str, words: Iterable[str], known: Collection[str]
+) -> None:
+    """Ends the program with a sentence where an option has a word, the name of a `kind`, that isn't known."""
+    for word in words:
+        if word not in known:
+            parser.error(f"{option}: no {kind} {word!r}; there are {', '.join(known)}")
 
 
 def numbers(text: str) -> list[int]:

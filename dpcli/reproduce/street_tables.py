@@ -101,9 +101,7 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     command = next(one for one in GROUPS if getattr(options, one.replace("-", "_")))
     methods = options.methods.split(",") if options.methods else list(METHODS[command])
-    unknown = [method for method in methods if method not in METHODS[command]]
-    if unknown:
-        parser.error(f"--methods: no method {unknown[0]!r} for {command}; there are {', '.join(METHODS[command])}")
+    runs.refuse_unknown(parser, f"--methods of {command}", "method", methods, METHODS[command])
     options.folder.mkdir(parents=True, exist_ok=True)
     raw = getattr(options, command.replace("-", "_"))
     print(run(Streets(command, raw, options.folder, options.points, options.limit), methods, options.model), end="")

@@ -14,7 +14,7 @@ import json
 import sys
 from pathlib import Path
 
-from dpcli.reproduce.runs import DASH, cut, dpc, thesis_rows, write_text
+from dpcli.reproduce.runs import DASH, cut, dpc, refuse_unknown, thesis_rows, write_text
 
 METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 _BOTH = ("--set", "consensus=none", "--set", "motion_head=false")
@@ -68,9 +68,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--rows", default=",".join(ROWS), help=f"some of {','.join(ROWS)}")
     options = parser.parse_args(own)
     chosen = options.rows.split(",")
-    unknown = [key for key in chosen if key not in ROWS]
-    if unknown:
-        parser.error(f"--rows: no row {unknown[0]!r}; there are {', '.join(ROWS)}")
+    refuse_unknown(parser, "--rows", "row", chosen, ROWS)
     options.folder.mkdir(parents=True, exist_ok=True)
     found, target = {}, options.folder / "table.md"
     about = (

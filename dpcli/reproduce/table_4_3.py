@@ -95,9 +95,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--methods", default=",".join(METHODS), help=f"some of {','.join(METHODS)}")
     options = parser.parse_args(argv)
     chosen = options.methods.split(",")
-    unknown = [method for method in chosen if method not in METHODS]
-    if unknown:
-        parser.error(f"--methods: no method {unknown[0]!r}; there are {', '.join(METHODS)}")
+    runs.refuse_unknown(parser, "--methods", "method", chosen, METHODS)
     options.folder.mkdir(parents=True, exist_ok=True)
     target = options.folder / "table.md"
     rooms = f"new rooms from {options.meshes.name}" if options.meshes else "the released rooms"

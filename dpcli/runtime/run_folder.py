@@ -23,6 +23,7 @@ from dpcli.runtime.torch_files import load_plain
 from dpcli.runtime.whole_file import DiskFull, disk_full, make_folder, whole_file
 from dpcli.text_files import read_json
 
+_FIRST_PICTURE = 10.0  # seconds of a run before curves are drawn: drawing takes half a second, more than a small epoch
 _TOLD = 3  # differences named when a run can't be continued
 _LOCK = ".lock"
 _PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
@@ -94,10 +95,8 @@ class RunFolder:
         self.columns, self.curves = tuple(columns), curves
         self.path, self.config, self.force = Path(path), config, force
         self.rows: list[dict] = []
-        self._drawn, self._draw_again = (
-            0,
-            0.0,
-        )  # rows that the picture shows; when it may be drawn next, by time.monotonic
+        # rows that the picture shows; when it may be drawn next
+        self._drawn, self._draw_again = 0, time.monotonic() + _FIRST_PICTURE
         self._lock = -1
         if self.path.exists() and not self.path.is_dir():
             raise UsageError(f"{self.path}: is a file; -o of train names a folder")

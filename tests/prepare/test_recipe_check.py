@@ -14,7 +14,8 @@ from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.prepare import recipe_check
 from dpcli.prepare.recipe_check import RECIPES, Tree, check_folder, check_rows, expand_braces, read_recipe
-from tests.support.prepare_helpers import ROOT, ToyReader, dpc, write_msr
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ROOT, ToyReader, write_msr
 
 RECIPE = """
 title = "A toy set"

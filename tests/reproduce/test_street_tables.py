@@ -52,5 +52,5 @@ def test_a_toy_table_is_made_once(command, tmp_path, monkeypatch, dpc_told, capf
 def test_a_method_that_needs_motion_is_refused_for_single_scans(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--kitti-det", str(tmp_path), "--methods", "scene"])
-    assert "no method 'scene' for kitti-det; there are network, ward, dbscan" in capsys.readouterr().err
+    assert "--methods of kitti-det: no method 'scene'; there are network, ward, dbscan" in capsys.readouterr().err
     assert set(METHODS["kitti-det"]) < set(METHODS["kitti-sf"])

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from dpcli.errors import DpcError, Stopped
+from dpcli.runtime import run_folder
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.store import ScoresReader
 from dpcli.store.file import open_store
@@ -198,8 +199,11 @@ def test_the_largest_seed_trains_and_is_kept_in_files(data, tmp_path, dpc_here):
     assert above.returncode == 2 and b"--seed" in above.stderr and str(largest).encode() in above.stderr
 
 
+@pytest.mark.parametrize("first", [0, 10])
 @pytest.mark.parametrize("error", [None, Stopped("saved"), OSError(28, "No space left on device")])
-def test_curves_take_little_of_the_time_and_show_all_rows_in_the_end(tmp_path, error):
+def test_curves_take_little_of_the_time_and_show_all_rows_in_the_end(tmp_path, monkeypatch, error, first):
+    """A run that is over before the time of its first picture draws one, at its end."""
+    monkeypatch.setattr(run_folder, "_FIRST_PICTURE", first)
     drawn: list[int] = []
 
     def curves(rows: list[dict], path: Path) -> None:
@@ -213,5 +217,8 @@ def test_curves_take_little_of_the_time_and_show_all_rows_in_the_end(tmp_path, e
                 folder.draw_curves()
             if error:
                 raise error
-    assert drawn[0] == 1 and len(drawn) <= 5
-    assert drawn[-1] == 10 or isinstance(error, OSError)
+    if first:
+        assert drawn == ([] if isinstance(error, OSError) else [10])
+    else:
+        assert drawn[0] == 1 and len(drawn) <= 5
+        assert drawn[-1] == 10 or isinstance(error, OSError)

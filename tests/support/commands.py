@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import subprocess
 import sys
 from unittest import mock
 
@@ -21,3 +24,11 @@ def typed(*words: object) -> int:
     """As `exit_code`, and files tell of this command line: what a process of its own would write, to the byte."""
     with mock.patch.object(sys, "argv", ["dpc", *map(str, words)]):
         return exit_code(*words)
+
+
+def told(*words: object) -> subprocess.CompletedProcess[str]:
+    """As `typed`; what it said on stdout and stderr stands in the result, as text."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = typed(*words)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())

@@ -14,6 +14,7 @@ from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
 from dpcli.errors import UsageError, reading
+from dpcli.runtime.device import cpu_count
 from dpcli.runtime.worker_server import ensure_server
 from dpcli.standard_streams import printable
 
@@ -67,7 +68,7 @@ def run_conversion(
         print_check(name, raw, made)
         return
     require_output(options.output)
-    if options.jobs != 1 and not options.dask:
+    if (options.jobs or cpu_count()) != 1 and not options.dask:
         ensure_server("dpcli.prepare.convert_item")  # while libraries load here and the folder is listed
     reader = made()
     from dpcli.prepare.commands.convert import convert_raw_data

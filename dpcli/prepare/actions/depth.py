@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from os.path import splitext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -36,7 +34,7 @@ from dpcli.prepare.decode.depth_files import (
     read_depth_video,
     require_depth,
 )
-from dpcli.prepare.decode.folder_listing import walk_folders
+from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -358,7 +356,7 @@ def _not_read(root: Path, clips: Collection[Path]) -> list[str]:
         if where and not below and not any(not is_hidden(name) for name in names):
             told.append(f"{where[:-1]} (empty)")
         below[:] = [name for name in below if Path(folder, name) not in clips]
-        found = Counter(splitext(name)[1].lower() for name in names if name.lower().endswith(_FOREIGN))
+        found = count_suffixes(names, _FOREIGN)
         told += [f"{where}{counted(count, f'{suffix} file')}" for suffix, count in sorted(found.items())]
     return sorted(told, key=natural_key)
 
@@ -393,8 +391,8 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        below = (name.lower() for _, _, files in walk_folders(path) for name in files if not is_hidden(name))
-        there = Counter(splitext(name)[1] for name in below if name.endswith((*_FOREIGN, *_CLOUDS)))
+        below = (name for _, _, files in walk_folders(path) for name in files)
+        there = count_suffixes(below, (*_FOREIGN, *_CLOUDS))
         seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(there.items()))
         clouds = not any(suffix.endswith(_FOREIGN) for suffix in there)
         advice = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, published_found, require_folder
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_text
 
@@ -213,8 +212,7 @@ class NvGesture:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        found = Counter(item.split for item in items if not item.problem)
-        lines = [f"{split}: {found[split]} of the {count} published clips found" for split, count in PUBLISHED.items()]
+        lines = published_found(items, PUBLISHED, "clips")
         for *others, last in filter(None, map(self._lists, PUBLISHED)):
             lines += (
                 [f"of several lists {last.name} is read, not {', '.join(p.name for p in others)}"] if others else []

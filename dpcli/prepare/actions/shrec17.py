@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -17,7 +16,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, published_found
 from dpcli.store import CloudSequence
 
 INTRINSICS = Intrinsics(463.889, 463.889, 320.0, 240.0)
@@ -195,10 +194,7 @@ class Shrec17:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        found = Counter(item.split for item in items if not item.problem)
-        return [
-            f"{split}: {found[split]} of the {count} published gestures found" for split, count in PUBLISHED.items()
-        ]
+        return published_found(items, PUBLISHED, "gestures")
 
 
 def _with_folder_problem(item: Item) -> Item:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dpcli.errors import DataError, reading
-from dpcli.npy_files import map_npy, open_archive, read_member, require_room
+from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
 from dpcli.prepare.array_files.mat5 import read_variables
 from dpcli.prepare.array_files.safe_pickle import load_arrays
 
@@ -193,15 +193,9 @@ def _npy(path: Path) -> np.ndarray | list[np.ndarray]:
 
 def _needs_pickle(file: Any) -> bool:
     try:
-        return bool(_header(file)[2].hasobject)
+        return bool(read_header(file)[2].hasobject)
     except Exception:  # a damaged header raises nearly anything; reading says so
         return False
-
-
-def _header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    return read(stream)
 
 
 def _member(path: Path, data: bytes) -> np.ndarray | list[np.ndarray]:

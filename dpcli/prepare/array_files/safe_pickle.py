@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import read_member, require_room
+from dpcli.npy_files import read_header, read_member, require_room
 
 # of an element: a number, text, or Python object, which is checked like all else
 _CODE = re.compile(r"[biufcSUO]\d{0,9}")
@@ -195,9 +195,7 @@ def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: boo
     try:
         data = archive.read(info)
         stream = io.BytesIO(data)
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        if pickled and header(stream)[2].hasobject:
+        if pickled and read_header(stream)[2].hasobject:
             return load_arrays(stream)
         return read_member(path, data)
     except pickle.UnpicklingError as error:

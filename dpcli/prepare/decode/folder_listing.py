@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -25,6 +26,16 @@ def walk_folders(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     for folder, below, names in os.walk(root, followlinks=True):
         below[:] = [name for name in below if not is_hidden(name) and not _leads_above(os.path.join(folder, name))]
         yield folder, below, names
+
+
+def count_suffixes(names: Iterable[str], suffixes: tuple[str, ...]) -> Counter[str]:
+    """Returns how many of a folder's names, but for hidden ones, end in each of the suffixes, which are lower case.
+
+    >>> count_suffixes(["a.BAG", "._a.bag", "b.bag", "c.txt"], (".bag", ".mcap"))
+    Counter({'.bag': 2})
+    """
+    lower = (name.lower() for name in names if not is_hidden(name))
+    return Counter(os.path.splitext(name)[1] for name in lower if name.endswith(suffixes))
 
 
 def files_below(root: Path) -> list[Path]:

@@ -7,14 +7,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
-from os.path import splitext
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.decode.folder_listing import walk_folders
+from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
 from dpcli.prepare.times_beside import with_times
@@ -78,8 +77,7 @@ def find_sequences(
 
 def _of_pictures(root: Path) -> str:
     """Returns what to do with the pictures or videos below a folder without clouds, "" where there are none."""
-    names = (name.lower() for _, _, files in walk_folders(root) for name in files if not is_hidden(name))
-    found = Counter(splitext(name)[1] for name in names if name.endswith(_PICTURES))
+    found = count_suffixes((name for _, _, files in walk_folders(root) for name in files), _PICTURES)
     return f"; found {', '.join(_counted(found))}: if they hold depth, `dpc prepare depth` reads them" if found else ""
 
 
@@ -133,11 +131,7 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        foreign = Counter(
-            splitext(name)[1].lower()
-            for name in names
-            if name.lower().endswith((*_FOREIGN, *_NOTES)) and not is_hidden(name)
-        )
+        foreign = count_suffixes(names, (*_FOREIGN, *_NOTES))
         if clouds or foreign:
             yield Path(folder), clouds, foreign
 

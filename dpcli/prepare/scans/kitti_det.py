@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
@@ -18,6 +18,7 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
+    check_objects,
     file_sizes,
     missing_files_problem,
     names_in,
@@ -126,9 +127,7 @@ class KittiDetection:
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
-        unknown = sorted(set(self.objects) - set(TYPES))
-        if unknown or not self.objects:
-            raise UsageError(f"--objects {','.join(self.objects)}: expected some of {', '.join(TYPES)}")
+        check_objects(self.objects, TYPES)
 
     @property
     def config(self) -> dict[str, Any]:

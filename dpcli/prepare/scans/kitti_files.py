@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,12 @@ def check_coordinates(name: str) -> None:
     """Raises UsageError unless it is one of COORDINATES."""
     if name not in COORDINATES:
         raise UsageError(f"--coordinates {name}: expected {' or '.join(COORDINATES)}")
+
+
+def check_objects(chosen: Collection[str], known: Collection[str]) -> None:
+    """Raises UsageError unless some classes of objects are chosen, all of them known."""
+    if not chosen or set(chosen) - set(known):
+        raise UsageError(f"--objects {','.join(chosen)}: expected some of {', '.join(known)}")
 
 
 def orient_points(points: np.ndarray, coordinates: str) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.path_names import first_names
-from dpcli.prepare.reader import Item, Sample, describe, natural_key, require_folder
+from dpcli.prepare.reader import Item, Sample, describe, natural_key, published_found, require_folder
 from dpcli.store import CloudSequence
 from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
@@ -167,8 +166,7 @@ class ModelNet40:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        found = Counter(item.split for item in items if not item.problem)
-        lines = [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
+        lines = published_found(items, PUBLISHED, "shapes")
         files = (path.name for path in self.raw.glob("[!.]*") if path.suffix.lower() in (".h5", ".hdf5"))
         left = sorted(name for name in files if not _FILE.fullmatch(name))
         return lines + ([f"not read, not called ply_data_train0.h5 or the like: {first_names(left)}"] if left else [])

@@ -19,6 +19,7 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
+    check_objects,
     file_sizes,
     is_no_camera,
     names_in,
@@ -111,9 +112,7 @@ class SemanticKitti:
         check_coordinates(self.coordinates)
         if self.group not in GROUPS:
             raise UsageError(f"--group {self.group}: expected {', '.join(GROUPS)}")
-        unknown = sorted(set(self.objects) - set(CLASSES))
-        if unknown or not self.objects:
-            raise UsageError(f"--objects {','.join(self.objects)}: expected some of {', '.join(CLASSES)}")
+        check_objects(self.objects, CLASSES)
         if self.frames < 1:
             raise UsageError(f"--frames {self.frames}: expected 1 or more")
 

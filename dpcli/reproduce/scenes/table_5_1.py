@@ -159,8 +159,7 @@ def main() -> None:
     own, fit = runs.cut(None)
     given = parser.parse_args(own)
     rows = given.rows.split(",")
-    if unknown := [row for row in rows if row not in known]:
-        parser.error(f"--rows: no row {unknown[0]!r}; there are {', '.join(known)}")
+    runs.refuse_unknown(parser, "--rows", "row", rows, known)
     given.out.mkdir(parents=True, exist_ok=True)
     if given.artemis:
         clips = {"as filmed": film_artemis(given.artemis, given.out, given.size or 512, given.frames)}

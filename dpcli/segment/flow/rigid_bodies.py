@@ -107,6 +107,12 @@ class _BodyFinder:
                     bodies = tried
         return _drop_empty_bodies(bodies)
 
+    def _improve(self, region: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns where ICP of a region's points (indices) ends from first motions (H,3,4): motions (h,3,4), the better half,
+        and their mean saturated residuals (h)."""
+        part = np.ascontiguousarray(self.source.columns[:, region])
+        return self.target.icp_many(part, first, 12, 0.08, self.reach, self.options.share, self.scale)
+
     def _find_other_motions(self, bodies: Bodies, k: int) -> np.ndarray:
         """Returns motions (H,3,4) of body k's points that ICP ends at when it starts from the first body's motion."""
         region = np.flatnonzero(bodies.label == k)
@@ -116,8 +122,7 @@ class _BodyFinder:
         first = motion_proposals.compose_motions(
             motion_proposals.propose_motions(points, np.zeros((0, 3))), bodies.motion[0]
         )
-        part = np.ascontiguousarray(self.source.columns[:, region])
-        ends, score = self.target.icp_many(part, first, 12, 0.08, self.reach, self.options.share, self.scale)
+        ends, score = self._improve(region, first)
         chosen = motion_proposals.choose_distinct(ends, score, self.points[region], 0.03, self.options.kept)
         return ends[[h for h in chosen if score[h] < 0.6]]
 
@@ -236,8 +241,7 @@ class _BodyFinder:
             first = motion_proposals.compose_motions(
                 motion_proposals.propose_motions(moved[region], lonely), now.motion[body]
             )
-            part = np.ascontiguousarray(self.source.columns[:, region])
-            ends, score = self.target.icp_many(part, first, 12, 0.08, self.reach, self.options.share, self.scale)
+            ends, score = self._improve(region, first)
             gain = score - current[region].mean()
             for h in motion_proposals.choose_distinct(ends, gain, self.points[region], 0.03, self.options.kept):
                 if gain[h] < -0.05:

@@ -71,12 +71,12 @@ def test_training_leaves_weights_logs_and_a_picture(run_folder):
     assert (run_folder / "best.safetensors").stat().st_size > 100_000
 
 
-def test_training_fits_a_confidence_that_streams_and_segments_take(data, run_folder, dpc):
+def test_training_fits_a_confidence_that_streams_and_segments_take(data, run_folder, dpc_here):
     found = stored_confidence(load_model(run_folder)[1].notes)
     assert 0.04 < found.temperature < 21 and 0 <= found.threshold <= 1
     assert found.clips > 0 and found.kept >= 0.95 and "validation videos" in found.source
     words = ("--model", run_folder, "--split", "all", "--segments", "--reject-below", "auto", "-o", "-")
-    done = dpc("classify", "predict", data, *words)
+    done = dpc_here("classify", "predict", data, *words)
     assert done.returncode == 0 and done.stdout.startswith(b"recording,start,end,class,confidence")
 
 

@@ -26,7 +26,7 @@ from tests.support.commands import exit_code
 from tests.support.gltf_files import arm, quad
 from tests.support.pretend_card import pretend_card
 
-# two rounds of pictures, as many steps of each; every step ends with a row, a state and curves
+# two rounds of pictures, as many steps of each; every step ends with a row and a state
 WORDS = ("--preset", "tiny", "--jobs", 1, "--steps", 8, "--set", "reuse=1")
 
 

@@ -21,8 +21,9 @@ from dpcli.prepare.pipeline import convert
 from dpcli.prepare.scans import modelnet40
 from dpcli.prepare.scans.modelnet40 import CLASS_NAMES, ModelNet40
 from dpcli.store import CloudsReader
+from tests.support.commands import told as dpc
 from tests.support.depth_png_helpers import ntu_files, person, write_files, write_lists
-from tests.support.prepare_helpers import ROOT, dpc, make_depth, write_msr
+from tests.support.prepare_helpers import ROOT, make_depth, write_msr
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -15,8 +15,8 @@ from dpcli.prepare.actions.shrec17 import INTRINSICS, Shrec17, keep_only_hand, r
 from dpcli.prepare.actions.shrec17_lists import GESTURES, Entry, parse_line
 from dpcli.prepare.pipeline import convert
 from dpcli.store import CloudsReader
+from tests.support.commands import told as dpc
 from tests.support.depth_png_helpers import REGION, hand_depth, png_bytes, write_gesture, write_lists
-from tests.support.prepare_helpers import dpc
 
 RNG = np.random.default_rng(0)
 A, B = "gesture_1/finger_1/subject_2/essai_1", "gesture_14/finger_2/subject_28/essai_3"

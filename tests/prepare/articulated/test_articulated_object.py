@@ -42,7 +42,7 @@ from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 from tests.support.articulated_helpers import cabinet, distance_to_triangles, link, write_urdf
 from tests.support.articulated_helpers import joint as joint_xml
-from tests.support.prepare_helpers import dpc
+from tests.support.commands import told as dpc
 
 KIND_NAMES = tuple(sorted(KINDS))
 

@@ -14,7 +14,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_sequence import random_rotation
 from dpcli.prepare.articulated.mbs import MultiBodySync, read_views
 from dpcli.store import CloudsReader
-from tests.support.prepare_helpers import dpc
+from tests.support.commands import told as dpc
 
 
 def motion(rng):

@@ -16,7 +16,7 @@ from dpcli.prepare.articulated.ogc_rooms import GeneratedRooms, RoomOptions, see
 from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
-from tests.support.prepare_helpers import dpc
+from tests.support.commands import told as dpc
 
 CUBE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 SIDES = [[1, 2, 3, 4], [5, 6, 7, 8], [1, 2, 6, 5], [2, 3, 7, 6], [3, 4, 8, 7], [4, 1, 5, 8]]

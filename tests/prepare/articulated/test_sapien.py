@@ -21,7 +21,7 @@ from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_ske
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 from tests.support.articulated_helpers import CUBE_OBJ, box, cabinet, joint, link, write_urdf
-from tests.support.prepare_helpers import dpc
+from tests.support.commands import told as dpc
 
 
 def load(path):

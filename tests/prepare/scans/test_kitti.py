@@ -22,8 +22,8 @@ from dpcli.prepare.scans.kitti_sf import CLASSES, KittiSceneFlow, flow_pair, unp
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence, CloudsReader
+from tests.support.commands import told as dpc
 from tests.support.kitti_helpers import P2, png_bytes, velodyne_to_camera, write_calibration, write_png, write_scan
-from tests.support.prepare_helpers import dpc
 
 H, W = 12, 16
 

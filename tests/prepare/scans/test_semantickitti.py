@@ -13,8 +13,9 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import convert
 from dpcli.prepare.scans.semantickitti import GROUPS, SemanticKitti, read_labels, read_poses
 from dpcli.store import CloudsReader
+from tests.support.commands import told as dpc
 from tests.support.kitti_helpers import P2, velodyne_to_camera, write_calibration, write_scan
-from tests.support.prepare_helpers import ROOT, dpc
+from tests.support.prepare_helpers import ROOT
 
 CAR, TRUCK, BUS, ROAD, MOVING_CAR = 10, 18, 13, 40, 252
 

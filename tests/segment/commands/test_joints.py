@@ -11,11 +11,32 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
+from dpcli.segment.commands import joints as command
 from dpcli.segment.commands.joints import find_joints
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code
+
+
+@pytest.fixture(scope="module", autouse=True)
+def found_once():
+    """The joints of the same points and motions are found once: most tests are about what is written of them."""
+    trees, with_axes, find, choose = {}, {}, command.kinematic_tree, command.with_point_axes
+
+    def tree(sequence, said):
+        key = (sequence.points.tobytes(), said.motion.tobytes())
+        return trees[key] if key in trees else trees.setdefault(key, find(sequence, said))
+
+    def axes(sequence, found):
+        return (
+            with_axes[id(found)] if id(found) in with_axes else with_axes.setdefault(id(found), choose(sequence, found))
+        )
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "kinematic_tree", tree)
+        patch.setattr(command, "with_point_axes", axes)
+        yield
 
 
 def objects(folder, count):
@@ -163,11 +184,11 @@ def test_meshes_far_from_the_origin_lie_on_the_points(place, few, tmp_path):
         file["points"][:] = file["points"][:] + place
         turn, middle = file["part_motion"][..., :3, :3].astype(np.float64), np.full(3, place)
         file["part_motion"][..., :3, 3] = file["part_motion"][..., :3, 3] + middle - turn @ middle
-        name = file["name"][0].decode()
+        name = file["name"][1].decode()  # the one of fewer parts
     far = {"sequence": name, "picture": None, "force": False}
     find_joints(str(tmp_path / "far.h5"), tmp_path / "far.urdf", **far)
     with PartsReader(tmp_path / "far.h5") as reader:
-        sequence = reader.read(0)
+        sequence = reader.read(1)
     root = int(np.bincount(sequence.part).argmax())
     lines = (tmp_path / "far_meshes" / f"part_{root}.obj").read_text().splitlines()
     mesh = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
