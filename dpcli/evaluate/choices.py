@@ -10,7 +10,7 @@ ALL_PROTOCOLS = tuple(dict.fromkeys((*PARTS_PROTOCOLS, *VIDEO_PROTOCOLS)))
 
 TOP_K = 5
 CLASSIFICATION_METRICS = ("accuracy", f"top{TOP_K}_accuracy", "balanced_accuracy", "macro_f1")
-SEGMENTATION_METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
+SEGMENTATION_METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri", "ari")
 MOTION_METRICS = ("epe3d", "accs", "accr", "outlier", "part_rotation", "part_displacement")
 PICTURE_METRICS = ("psnr", "psnr_foreground", "ssim", "ms_ssim", "silhouette_iou")
 FRECHET_METRICS = ("fvd", "fid_vid_r3d50", "fid_vid_inception")

@@ -10,6 +10,7 @@ TITLES = {
     "rec": "recall",
     "miou": "mIoU",
     "ri": "Rand index",
+    "ari": "adjusted Rand index",
     "epe3d": "EPE3D",
     "epe3d_no_motion": "EPE3D of no motion",
     "accs": "AccS",

@@ -173,6 +173,7 @@ def random_objects(count: int, seed: int = 0, ties: bool = True) -> list[Segment
                 confidence,
                 mean,
                 mean.copy(),
+                mean - 0.2,
                 int(matched.sum() + rng.integers(0, 3)),
                 2,
                 0,

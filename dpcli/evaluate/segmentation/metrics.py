@@ -18,7 +18,7 @@ from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.average_precision import RankedPredictions, average_precision
 from dpcli.evaluate.segmentation.part_matching import FrameMatch, match_parts, mean_iou
-from dpcli.evaluate.segmentation.rand_index import rand_index
+from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index, rand_index
 
 _RELEASE_FLOOR = 1e-10  # of the published denominators
 Ratio = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -37,8 +37,8 @@ class Frame:
 class SegmentationStatistics:
     """Holds all that the metrics need, concatenated over objects (sequences) in the order they came.
 
-    iou f64, matched bool, confidence f64 (P): the predictions that count; object_iou, object_rand f64 (O): mean over
-    the frames of each object, NaN where no frame counts; truth_parts, frames, skipped: counted true parts and frames,
+    iou f64, matched bool, confidence f64 (P): the predictions that count; object_iou, object_rand, object_adjusted f64 (O):
+    mean over the frames of each object, NaN where no frame counts; truth_parts, frames, skipped: counted true parts and frames,
     and frames without truth; dropped: predictions on ignored ground; unknown: points without a true part.
     """
 
@@ -47,6 +47,7 @@ class SegmentationStatistics:
     confidence: np.ndarray
     object_iou: np.ndarray
     object_rand: np.ndarray
+    object_adjusted: np.ndarray
     truth_parts: int
     frames: int
     skipped: int
@@ -63,7 +64,7 @@ class SegmentationMetrics:
     """Holds shares in [0, 1] (with the published matching, recall and F1 can exceed 1); NaN = undefined (0/0).
 
     ap: average precision, pq: panoptic quality, f1, pre(cision), rec(all): at IoU 0.5, pooled over all frames.
-    miou, ri (Rand index): mean over the frames of an object, then over objects.
+    miou, ri (Rand index), ari (adjusted Rand index): mean over the frames of an object, then over objects.
     """
 
     ap: float
@@ -73,6 +74,7 @@ class SegmentationMetrics:
     rec: float
     miou: float
     ri: float
+    ari: float
     predictions: int
     true_positives: int
     truth_parts: int
@@ -93,7 +95,7 @@ def segmentation_update(
     """
     options = {"ignore_below": ignore_below, "release": _is_release(protocol)}
     matches: list[FrameMatch] = []
-    ious, rands, skipped, present, unknown = [], [], 0, 0, 0
+    ious, rands, adjusted, skipped, present, unknown = [], [], [], 0, 0, 0
     for number, frame in enumerate(frames):
         unknown += int((frame.truth < 0).sum())
         match = match_parts(frame.truth, frame.part, frame.probability, **options)
@@ -109,11 +111,12 @@ def segmentation_update(
         present += len(np.unique(frame.part[frame.part >= 0]))
         ious.append(mean_iou(frame.truth, frame.part, **options))
         rands.append(rand_index(frame.truth, frame.part, ignore_below=ignore_below))
+        adjusted.append(adjusted_rand_index(frame.truth, frame.part, ignore_below=ignore_below))
     joined = [
         np.concatenate([np.zeros(0, kind), *(getattr(match, key) for match in matches)])
         for key, kind in (("iou", np.float64), ("matched", bool), ("confidence", np.float64))
     ]
-    means = [np.array([mean_defined(np.array(values))]) for values in (ious, rands)]
+    means = [np.array([mean_defined(np.array(values))]) for values in (ious, rands, adjusted)]
     parts = sum(match.truth_parts for match in matches)
     return SegmentationStatistics(*joined, *means, parts, len(matches), skipped, present - len(joined[0]), unknown)
 
@@ -182,6 +185,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
         **{key: float(value) for key, value in scores.items()},
         miou=mean_defined(statistics.object_iou),
         ri=mean_defined(statistics.object_rand),
+        ari=mean_defined(statistics.object_adjusted),
         predictions=count,
         true_positives=hits,
         truth_parts=truth,
@@ -194,7 +198,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
 
 
 def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol: str = "dpc") -> WeightedMetric:
-    """Returns ap, pq, f1, pre, rec, miou and ri as functions of how often each sequence counts.
+    """Returns ap, pq, f1, pre, rec, miou, ri and ari as functions of how often each sequence counts.
 
     sequences: the statistics of each one. Raises ValueError for an unknown protocol.
     """
@@ -205,7 +209,7 @@ def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol:
     )
     truth_parts = [one.truth_parts for one in sequences]
     sums = np.stack([hits, predictions, iou, truth_parts], axis=1).astype(np.float64)
-    over_sequences = means_of_samples({"miou": whole.object_iou, "ri": whole.object_rand})
+    over_sequences = means_of_samples({"miou": whole.object_iou, "ri": whole.object_rand, "ari": whole.object_adjusted})
     ranked = RankedPredictions(whole.confidence, whole.matched, sequence, keep_order=_is_release(protocol))
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:

@@ -25,7 +25,14 @@ from dpcli.evaluate.segmentation.motion_metrics import (
     part_motion_update,
 )
 from dpcli.evaluate.segmentation.rigid_motion import true_flow, true_motion
-from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Counted, Keeping, count_sequences, read_counted
+from dpcli.evaluate.segmentation.sequence_pass import (
+    NOT_KEPT,
+    Counted,
+    Keeping,
+    count_sequences,
+    read_counted,
+    statistics_of,
+)
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair, named_truth
 from dpcli.store.schema import METERS
 
@@ -96,7 +103,7 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
     found = [(name, row) for name, row in zip(counted.names, counted.rows, strict=True) if len(row["pairs"])]
     without_pairs = [name for name, row in zip(counted.names, counted.rows, strict=True) if not len(row["pairs"])]
     without_truth = sum(row["predicted_pairs"] - len(row["pairs"]) for row in counted.rows)
-    statistics = [MotionStatistics(**row["statistics"]) for _, row in found]
+    statistics = statistics_of(MotionStatistics, [row for _, row in found], path)
     _check_found(statistics, without_truth, path)
     reason = "no frame pair predicted" if from_poses else "no frame pair f -> f + 1 predicted"
     batch = RELEASE_BATCH if protocol == "release" else None

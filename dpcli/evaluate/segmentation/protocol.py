@@ -22,7 +22,14 @@ from dpcli.evaluate.segmentation.metrics import (
     segmentation_update,
     segmentation_weighted,
 )
-from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Counted, Keeping, count_sequences, read_counted
+from dpcli.evaluate.segmentation.sequence_pass import (
+    NOT_KEPT,
+    Counted,
+    Keeping,
+    count_sequences,
+    read_counted,
+    statistics_of,
+)
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair, named_truth
 
 FIXES = (
@@ -82,12 +89,12 @@ def evaluate_segmentation(
             about = {"task": "segmentation", "protocol": protocol, "ignore_below": ignore_below}
             measure = partial(_sequence_values, protocol=protocol, ignore_below=ignore_below)
             counted = count_sequences(paired, measure, about, keeping)
-    return _make_report(counted, resampling or Resampling(0))
+    return _make_report(counted, path, resampling or Resampling(0))
 
 
-def _make_report(counted: Counted, resampling: Resampling) -> SegmentationReport:
+def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> SegmentationReport:
     about, labels = counted.about, [row["label"] for row in counted.rows]
-    sequences = [SegmentationStatistics(**row["statistics"]) for row in counted.rows]
+    sequences = statistics_of(SegmentationStatistics, counted.rows, path)
     protocol, ignore_below = about["protocol"], about["ignore_below"]
     whole = merge_statistics(sequences)
     if whole.frames == 0:

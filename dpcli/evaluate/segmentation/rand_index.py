@@ -27,18 +27,18 @@ def rand_index(truth: np.ndarray, part: np.ndarray, *, ignore_below: int = 0) ->
     return 1 - (squares[0] + squares[1] - 2 * squares[2]) / count**2
 
 
-def adjusted_rand_index(truth: np.ndarray, part: np.ndarray) -> float:
+def adjusted_rand_index(truth: np.ndarray, part: np.ndarray, *, ignore_below: int = 0) -> float:
     """Returns the Rand index less its expectation under random labels, over its largest value less that.
 
-    Hubert & Arabie 1985. Ids i (N) each; points with truth below 0 are taken out, predicted -1 is one more group. It is
-    1 for equal groupings, also where both are one group or all single points (0/0); NaN without points.
+    Hubert & Arabie 1985. Ids i (N) each, taken as `rand_index` does. It is 1 for equal groupings, also where both are one
+    group or all single points (0/0); NaN without points.
 
     >>> round(adjusted_rand_index(np.array([0, 0, 1, 1]), np.array([5, 5, 5, 7])), 4)
     0.0
     >>> adjusted_rand_index(np.array([0, 0, 1, 1]), np.array([3, 3, 2, 2]))
     1.0
     """
-    known = truth >= 0
+    known = valid_points(truth, ignore_below)
     if not known.any():
         return np.nan
     found = overlap(truth[known], part[known].astype(np.int64) + 1)

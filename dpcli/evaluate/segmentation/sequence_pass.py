@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import LeftOut
@@ -21,6 +21,7 @@ from dpcli.store.statistics import StatisticsReader, StatisticsWriter
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
+Statistics = TypeVar("Statistics")
 Measure = Callable[[SequencePair], dict[str, Any]]
 
 _CHOICES = {"left_out", "protocol", "split", "truth"}  # that a kept evaluation was counted with
@@ -58,6 +59,14 @@ class Counted:
     def left_out(self) -> list[LeftOut]:
         """Returns the samples that don't count."""
         return [LeftOut(reason, names) for reason, names in self.about["left_out"]]
+
+
+def statistics_of(kind: type[Statistics], rows: Iterable[dict[str, Any]], path: str | Path) -> list[Statistics]:
+    """Returns the statistics of sequences, of a dataclass, from their rows. Raises DataError where a kept file has other fields."""
+    try:
+        return [kind(**row["statistics"]) for row in rows]
+    except TypeError:
+        raise DataError(f"{path}: counted by another version of dpc; name the parts file to count again") from None
 
 
 def read_counted(

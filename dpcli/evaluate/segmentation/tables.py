@@ -52,7 +52,7 @@ def segmentation_notes(report: SegmentationReport) -> list[str]:
     lines = [
         f"Split {report.split!r}, truth: {report.truth}. AP, PQ, F1, precision, recall: {main.true_positives} found of "
         f"{counted(main.truth_parts, 'true part')}, {counted(main.predictions, 'prediction')}, pooled over "
-        f"{counted(main.frames, 'frame')}; mIoU, Rand index: mean over the frames of "
+        f"{counted(main.frames, 'frame')}; mIoU, Rand index, plain and adjusted: mean over the frames of "
         f"each of {counted(main.objects, 'sequence')}, then over these.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         *_protocol_notes(report.protocol),

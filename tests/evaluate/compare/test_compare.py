@@ -29,7 +29,7 @@ from tests.support.scores_helpers import CLASSES, write_scores
 def test_identical_files_do_not_differ(run, scores, parts):
     for given in ((scores["good"],) * 2, (parts["good"], parts["good"], "--truth", parts["truth"])):
         found = json.loads(run("compare", *given, "--json"))
-        assert len(found["metrics"]) == (3 if len(given) == 2 else 13)
+        assert len(found["metrics"]) == (3 if len(given) == 2 else 14)
         for own in found["metrics"].values():
             assert own["difference"] == 0 and own["p"] == 1 and own["interval"] == [0, 0]
             assert not own["a_better"] and not own["b_better"] and own["wilcoxon_p"] in (1, None)

@@ -105,7 +105,7 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         ("{}\n", "not an object of"),
         ("hello", "neither a file"),
         ("\x00\xff", "neither"),
-        (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 7 metrics not finite"),
+        (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 8 metrics not finite"),
     ):
         path.write_text(text)
         with pytest.raises(DpcError, match=words):

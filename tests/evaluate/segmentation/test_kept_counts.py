@@ -53,3 +53,17 @@ def test_kept_counts_without_their_choices_are_refused(files):
         file["provenance"][-1] = json.dumps(entry)
     with pytest.raises(DataError, match="its provenance lacks truth"):
         evaluate_segmentation(folder / "edited.h5", None)
+
+
+@pytest.mark.parametrize("evaluate", [evaluate_segmentation, evaluate_motion])
+def test_kept_counts_of_another_version_are_refused(files, evaluate):
+    folder, parts, truth = files
+    kept = folder / f"old_{evaluate.__name__}.h5"
+    evaluate(parts, truth, keeping=Keeping(kept))
+    with h5py.File(kept, "r+") as file:
+        rows = [json.loads(row) for row in file["statistics"].asstr()[:]]
+        for row in rows:
+            row["statistics"].popitem()
+        file["statistics"][:] = [json.dumps(row) for row in rows]
+    with pytest.raises(DataError, match=f"{kept.name}: counted by another version of dpc; name the parts file"):
+        evaluate(kept, None)

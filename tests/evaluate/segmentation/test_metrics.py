@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.metrics import adjusted_rand_score
 from typer.testing import CliRunner
 
 from dpcli.cli.app import app
@@ -73,6 +74,10 @@ def test_golden_cases_of_the_published_code(golden):
         np.testing.assert_allclose(seven(metrics)[:5], case["seg_scores"], atol=TOLERANCE, err_msg=name)
         np.testing.assert_allclose(found.object_iou, case["miou_per_frame"], atol=TOLERANCE, err_msg=name)
         np.testing.assert_allclose(found.object_rand, case["ri_per_frame"], atol=TOLERANCE, err_msg=name)
+        for ids, mask, adjusted in zip(case["segm"], case["mask"], found.object_adjusted, strict=True):
+            counts = [np.count_nonzero(ids == one) >= below for one in ids]
+            expected = adjusted_rand_score(ids[counts], mask.argmax(1)[counts])
+            np.testing.assert_allclose(adjusted, expected, atol=TOLERANCE, err_msg=name)
         np.testing.assert_allclose(found.iou, case["pred_iou"], atol=TOLERANCE, err_msg=name)
         np.testing.assert_allclose(found.confidence, case["confidence"], atol=TOLERANCE, err_msg=name)
         assert np.array_equal(found.matched, case["pred_matched"]), name
