@@ -41,7 +41,7 @@ def identify(path: Path, clouds: Sequence[Cloud], track: str, keep: tuple[str, .
     where the frames can't be what ``track`` says.
     """
     if track == ROWS:
-        lost = next((reason for cloud in clouds for reason in cloud.dropped), "")
+        lost = next((reason for cloud in clouds for reason in cloud.dropped if reason.endswith("dropped")), "")
         counts = sorted({len(cloud.points) for cloud in clouds})
         if lost or len(counts) > 1:
             why = f"reading left some out ({lost})" if lost else f"its frames have {counts[0]} to {counts[-1]} points"
@@ -155,9 +155,9 @@ class TrackedViews(OwnScans):
 
     @property
     def length_unit(self) -> str:
-        """Returns the unit that the option names, unless it is the default; then the views file's, "" where it tells none."""
+        """Returns the unit that the options name, where one of them is given; else the views file's, "" where it tells none."""
         with ViewsReader(self.raw) as views:
-            return self.unit if self.unit != "m" else views.header.length_unit
+            return self.unit if self.unit != "m" or self.scale is not None else views.header.length_unit
 
     def items(self) -> list[Item]:
         """Returns the one sample, named as the views are. Raises DataError where they have no tracks."""

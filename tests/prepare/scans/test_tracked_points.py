@@ -137,6 +137,27 @@ def test_rows_name_points_though_some_are_no_measurement(tmp_path: Path) -> None
         np.testing.assert_array_equal(sequence.points, points[frame, sequence.track])
 
 
+def test_rows_of_tables_that_hold_nothing_are_counted(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    points = _moving(np.random.default_rng(11))
+    rows = [f"{s},{t},{x},{y},{z}" for s in "ab" for t in range(_FRAMES) for x, y, z in points[t].tolist()]
+    for t in range(_FRAMES):  # each frame of the first sequence lacks another point
+        rows[t * _POINTS + t] = ",,,,"
+    (tmp_path / "all.csv").write_text("recording,frame,x,y,z\n" + "\n".join(rows) + "\n")
+    command = ("prepare", "clouds", tmp_path / "all.csv", "--sequence-column", "recording", "-o", tmp_path / "out.h5")
+    assert 0 == exit_code(*command)
+    assert "rows with nothing between their delimiters dropped: 5" in capfd.readouterr().err
+    assert exit_code(*command, "--track", "rows", "--force")
+    assert "reading left some out (rows with nothing" in capfd.readouterr().err
+
+
+def test_rows_with_few_digits_are_the_same_points(tmp_path: Path) -> None:
+    points = 1e6 * _moving(np.random.default_rng(12)) + 5e6
+    for t, frame in enumerate(points):
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        np.savetxt(tmp_path / "scan" / f"{t}.xyz", frame, fmt="%.5e")
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "scan", "--track", "rows", "-o", tmp_path / "out.h5")
+
+
 def test_what_cannot_be_an_identity_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
     points = _moving(np.random.default_rng(5))
     folder = tmp_path / "scan"
@@ -173,6 +194,11 @@ def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., st
         np.testing.assert_array_equal(sequence.part.reshape(4, 200), np.tile(views.part, (4, 1)))
         np.testing.assert_array_equal(sequence.track.reshape(4, 200), np.tile(np.arange(200), (4, 1)))
         np.testing.assert_array_equal(sequence.time, views.header.time)
+    scaled = ("prepare", "clouds", tmp_path / "views.h5", "-o", tmp_path / "scaled.h5", "--scale", "1000")
+    assert 0 == exit_code(*scaled)
+    with CloudsReader(tmp_path / "scaled.h5") as clouds:  # as of other inputs: `--unit` names it, by default meters
+        assert clouds.length_unit == "m"
+        np.testing.assert_allclose(clouds.read(0).points, sequence.points / 1000, rtol=1e-6)
     assert 0 == exit_code(
         "prepare", "synthetic", "animal", "-o", tmp_path / "bare.h5", "--size", "16", "--frames", "2", "--tracks", "0"
     )
