@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,18 +43,42 @@ class Thinning:
         candidates = voxel_representatives(cloud, self.points)
         return candidates[self._draw(len(candidates), rng)]
 
+    def _choose_again(self, frame: np.ndarray, rank: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Returns indices i64 (min(N, points)) into one frame f32 (N,3): first of the points of rank 0 or more, i64 (N), the
+        lowest, then what `choose` takes of the others.
+        """
+        if len(frame) <= self.points:
+            return np.arange(len(frame))
+        again = np.flatnonzero(rank >= 0)
+        index = again[np.argsort(rank[again])][: self.points]
+        others = np.setdiff1d(np.arange(len(frame)), index)
+        if more := self.points - len(index):
+            index = np.concatenate([index, others[replace(self, points=more).choose(frame[others], rng)]])
+        return index if self.sampling == "fps" else np.sort(index)
+
     def _draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         return np.sort(rng.choice(count, self.points, replace=False))
 
     def apply(self, sequence: CloudSequence, rng: np.random.Generator) -> CloudSequence:
-        """Returns the sequence with each frame thinned; per-point fields follow their points."""
+        """Returns the sequence with each frame thinned; per-point fields follow their points.
+
+        Points with identities keep them: those chosen in an earlier frame come first, and only what they leave is drawn.
+        """
         counts = np.diff(sequence.frame_offsets)
         if self.points == 0 or counts.max(initial=0) <= self.points:
             return sequence
         chosen = []
+        tracks = None if sequence.track is None else np.unique(sequence.track, return_inverse=True)[1].reshape(-1)
+        rank = np.full(0 if tracks is None else tracks.max() + 1, -1)  # of a track: how many were chosen before it
         for start, count in zip(sequence.frame_offsets[:-1], counts, strict=True):
             frame = sequence.points[start : start + count]
-            index = self.choose(frame, rng) if count > self.points else np.arange(count)
+            if tracks is None:
+                index = self.choose(frame, rng) if count > self.points else np.arange(count)
+            else:
+                own = tracks[start : start + count]
+                index = self._choose_again(frame, rank[own], rng)
+                fresh = own[index][rank[own[index]] < 0]
+                rank[fresh] = rank.max() + 1 + np.arange(len(fresh))
             chosen.append(index + start)
         sequence.take_points(np.concatenate(chosen), offsets(np.array([len(c) for c in chosen], np.int64)))
         return sequence

@@ -13,6 +13,7 @@ from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.parts import PartsReader, PartsSample
 
 _SURE = 0.5  # probability below which a predicted part counts as unknown
+_ONE_STRAY_OF, _MOST_STRAYS, _APART = 64, 8, 2.0  # points of a frame; and how much farther than all others they lie
 MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the better one first
 
 
@@ -38,15 +39,29 @@ class LoadedPair:
 
 
 def sequence_scale(frames: list[np.ndarray]) -> float:
-    """Returns 1 / (twice the largest distance of a point from its frame's mean).
+    """Returns 1 / (twice the largest distance of a point from its frame's mean), stray points left out.
 
     A sequence times this has diameter 1 or less.
 
     >>> sequence_scale([np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])])
     0.25
     """
-    reach = max((float(np.linalg.norm(f - f.mean(0), axis=1).max()) for f in frames if len(f)), default=0.0)
+    known = [without_strays(frame) for frame in frames if len(frame)]
+    reach = max((float(np.linalg.norm(f - f.mean(0), axis=1).max()) for f in known), default=0.0)
     return 0.5 / reach if reach > 0 else 1.0
+
+
+def without_strays(frame: np.ndarray) -> np.ndarray:
+    """Returns the points (N,3) of a frame without stray ones, such as flying pixels, beside which an object would seem tiny:
+    one of 64 and eight at most, each more than twice as far from the middle as all that stay. More may be a further object.
+    """
+    most = min(len(frame) // _ONE_STRAY_OF, _MOST_STRAYS)
+    if not most:
+        return frame
+    distance = np.linalg.norm(frame - np.median(frame, axis=0), axis=1)
+    far = np.sort(distance)[-most - 1 :]
+    apart = np.flatnonzero((far[:-1] > 0) & (far[1:] > _APART * far[:-1]))
+    return frame[distance <= far[apart[0]]] if len(apart) else frame
 
 
 def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarray:

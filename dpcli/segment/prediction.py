@@ -14,7 +14,7 @@ from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
-from dpcli.segment.frame_pairs import choose_points, sequence_scale
+from dpcli.segment.frame_pairs import choose_points, sequence_scale, without_strays
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
@@ -113,12 +113,16 @@ def _prepare_frames(
     """
     filled = [cloud for cloud in clouds if len(cloud)]
     numbers = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
-    center = np.float32(np.concatenate(filled or [np.zeros((1, 3))]).mean(0, dtype=np.float64))
+    known = [without_strays(cloud) for cloud in filled] or [np.zeros((1, 3))]
+    center = np.float32(np.concatenate(known).mean(0, dtype=np.float64))
     scale = np.float32(sequence_scale(filled)) if options.normalize else np.float32(1)
     whole = [torch.from_numpy((clouds[t] - center) * scale) for t in numbers]
     if tracks is not None:
         return _Frames(numbers, whole, whole, float(scale), center, [tracks[t] for t in numbers])
-    thin = [_thin(cloud, options.points, generator(seed, index, t)) for t, cloud in zip(numbers, whole)]
+    known = [without_strays(cloud.numpy()) for cloud in whole]  # the nearest points tell the part of those left out
+    thin = [
+        _thin(torch.from_numpy(cloud), options.points, generator(seed, index, t)) for t, cloud in zip(numbers, known)
+    ]
     return _Frames(numbers, whole, thin, float(scale), center)
 
 

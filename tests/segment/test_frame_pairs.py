@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.segment.frame_pairs import PairSource, backward_flow
+from dpcli.segment.frame_pairs import PairSource, backward_flow, without_strays
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader
 from tests.support.drawers import drawer, predicted
 
@@ -57,6 +57,20 @@ def test_true_flow_of_loaded_pairs_maps_parts_onto_parts(data):
     for part in (0, 1):  # independent samples of the same solid: the same extent within sampling
         a, b = moved[pair.part[0] == part], pair.points[1][pair.part[1] == part]
         assert np.abs(a.mean(0) - b.mean(0)).max() < 0.08
+
+
+@pytest.mark.parametrize("points", [63, 64, 320, 2000])
+def test_a_few_points_far_from_all_others_are_strays(points):
+    rng = np.random.default_rng(points)
+    cloud = rng.random((points, 3))
+    most = min(points // 64, 8)
+    for strays in range(most + 3):
+        far = 20 + rng.random((strays, 3))
+        kept = without_strays(np.concatenate([cloud, far]))
+        expected = cloud if 0 < strays <= min((points + strays) // 64, 8) else np.concatenate([cloud, far])
+        np.testing.assert_array_equal(kept, expected)
+    assert len(without_strays(np.ones((points, 3)))) == points
+    assert len(without_strays(np.concatenate([np.zeros((points, 3)), np.ones((1, 3))]))) == points + 1
 
 
 def test_a_pose_without_an_inverse_is_bad_data(tmp_path):

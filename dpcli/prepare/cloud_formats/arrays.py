@@ -69,7 +69,7 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
     columns = {name: values for name, values in arrays.items() if values.shape == (len(cloud.points),)}
     missing = [name for name in keep if name not in columns]
     if missing:
-        raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
+        raise DataError(f"{path}: column {missing[0]}: no such array of one number a point")
     cloud.extra = kept_columns(path, columns, keep)
     cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud
@@ -91,7 +91,7 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         cloud.unread += without(array.dtype.names, single)
         return cloud
     if keep:
-        raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
+        raise DataError(f"{path}: column {keep[0]}: its columns have no names")
     if array.shape == (0,):  # of an empty list of points
         return Cloud(np.zeros((0, 3), np.float32))
     if array.ndim == 3 and array.shape[0] == 1:  # a batch of one

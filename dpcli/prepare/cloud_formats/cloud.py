@@ -26,7 +26,7 @@ class Cloud:
     """Holds points f32 or f64 (N,3) as stored, NaN where the file has it.
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
-    coordinates are in, as in `store.schema.METERS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
+    coordinates are in, as in `store.schema.METERS`, or "". extra: columns that were asked for, (N) each as stored. columns: the
     names of those that points and colors came from. unread: the names of those that nobody asked for. dropped:
     counts of points that the file itself says don't count, by reason, and of what else it says and isn't used. track: the
     identities i64 (N) of the points across frames, or None.
@@ -146,27 +146,29 @@ def as_points(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str]) -> dict[str, np.ndarray]:
-    """Returns the columns that were asked for, f32 (N), by name. Raises DataError when one is missing or no numbers."""
+    """Returns the columns that were asked for, (N) as stored, by name. Raises DataError when one is missing or no numbers."""
     for name in keep:
         if name not in columns:
             raise DataError(f"{path}: no column {name} among those to read; found {', '.join(columns) or 'no names'}")
         if columns[name].dtype.kind not in "fiub" or columns[name].ndim != 1:
             raise DataError(f"{path}: column {name} holds no numbers, one a point; ask for another, or none")
-        _require_float32(path, name, columns[name])
-    return {name: columns[name].astype(np.float32) for name in keep}
+    return {name: columns[name] for name in keep}
 
 
-def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
-    """Raises DataError where float32, which files keep columns in, can't tell the values of a column apart."""
+def as_float32(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    """Returns a column of one frame as f32 (N), in which files keep them. Raises DataError where that can't tell its values
+    apart.
+    """
     known = values[np.isfinite(values)].astype(np.float64)
     if not len(known) or np.abs(known).max() < _WHOLE_FLOAT32:
-        return
+        return values.astype(np.float32)
     lost = float(np.abs(known - known.astype(np.float32)).max())
     if lost > _LOST * float(np.ptp(known)):
         raise DataError(
             f"{path}: column {name}: float32, in which columns are kept, would round its values by up to {lost:.3g};"
             " keep smaller numbers, such as times since the beginning"
         )
+    return values.astype(np.float32)
 
 
 def color_of_harmonics(first: np.ndarray) -> np.ndarray:

@@ -102,6 +102,4 @@ def unpack_supersplat(
 
 def _refuse_kept(path: Path, keep: Sequence[str]) -> None:
     if keep:
-        raise DataError(
-            f"{path}: --keep-fields {keep[0]}: of Gaussians only centers and colors are read; save them as .ply"
-        )
+        raise DataError(f"{path}: column {keep[0]}: of Gaussians only centers and colors are read; save them as .ply")

@@ -64,7 +64,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     """Returns the points of all rows of a table, with colors where it has them."""
     if not table.names:
         if keep:
-            raise DataError(f"{table.path}: --keep-fields {keep[0]}: its columns have no names")
+            raise DataError(f"{table.path}: column {keep[0]}: its columns have no names")
         if not 3 <= table.width <= MOST_UNNAMED:
             require_columns(table.path, len(table.numbered), table.width)
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file

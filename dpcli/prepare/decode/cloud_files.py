@@ -63,5 +63,5 @@ def _read(path: Path, bin_columns: int | None, keep: Sequence[str]) -> Cloud:
     if path.suffix.lower() != ".bin":
         return _READERS[path.suffix.lower()](path, keep)
     if keep:
-        raise DataError(f"{path}: --keep-fields {keep[0]}: the columns of a .bin have no names")
+        raise DataError(f"{path}: column {keep[0]}: the columns of a .bin have no names")
     return read_bin(path, bin_columns or guess_bin_columns([path])[0])

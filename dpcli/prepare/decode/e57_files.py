@@ -28,7 +28,7 @@ def read_e57(path: Path, keep: Sequence[str] = ()) -> Cloud:
     Raises DataError when the file is damaged, which its checksums tell, or has no scan; DpcError without the package.
     """
     if keep:
-        raise DataError(f"{path}: --keep-fields {keep[0]}: of E57 only points and colors are read; save it as .ply")
+        raise DataError(f"{path}: column {keep[0]}: of E57 only points and colors are read; save it as .ply")
     library = _load_library()
     text = _called(path, library.raw_xml)
     scans = [_FIELD.findall(prototype) for prototype in _PROTOTYPE.findall(text)]

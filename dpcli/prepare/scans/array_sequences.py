@@ -237,7 +237,7 @@ class ArraySequences(OwnScans):
                 frame,
                 None if colors is None else colors[t],
                 unit,
-                extra={name: values[t].astype(np.float32) for name, values in kept.items()},
+                extra={name: values[t] for name, values in kept.items()},
             )
             for t, frame in enumerate(frames)
         ]
@@ -258,7 +258,14 @@ class ArraySequences(OwnScans):
 
     def _column(self, path: Path, arrays: Mapping[str, Any], name: str, source: Source, axes: str) -> np.ndarray:
         flat = tuple(length for letter, length in zip(axes, arrays[source.keys[0]].shape) if letter != "C")
-        if not axes or name not in arrays or tuple(arrays[name].shape) != flat:
+        found = arrays.get(name)
+        if (
+            not axes
+            or found is None
+            or isinstance(found, list)
+            or tuple(found.shape) != flat
+            or found.dtype.kind not in "fiub"
+        ):
             option = "--track" if name == self.track else "--keep-fields"
             raise DataError(
                 f"{path}: {option} {name}: no array of one number for each point, {flat or 'as frames have'}"

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
-from dpcli.prepare.cloud_formats.cloud import Cloud, without
+from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.labels import LabelTable
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
@@ -128,7 +128,10 @@ def assemble(
         notes |= _rounded(frames, each, divisor)
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
     notes |= _further([clouds[t] for t in kept], item.extra["unread"]) if "unread" in item.extra else {}
-    extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
+    extra = {
+        kept_name(name): np.concatenate([as_float32(item.path, name, clouds[t].extra[name]) for t in kept])
+        for name in clouds[0].extra
+    }
     sequence = CloudSequence(
         item.name,
         points,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import find_further_points, find_recording_columns
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
-from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
-from dpcli.prepare.cloud_formats.text_numbers import read_text_table
+from dpcli.prepare.cloud_formats.text_cloud import EMPTY, cloud_of_table
+from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
@@ -148,13 +148,14 @@ class TableSequences(OwnScans):
         if item.extra["time"] and time is None:
             raise DataError(f"{item.path}: no column holds rising times, though the first table has one")
         clouds = loaded.frames(part)[:: self.stride]
+        dropped = loaded.cloud.dropped
         if self.track == ROWS:
-            identify(item.path, clouds, ROWS, self.keep)
+            identify(item.path, [replace(clouds[0], dropped=dropped), *clouds], ROWS, self.keep)
+        if item.extra["part"]:  # the first sequence told the table's
+            dropped = {what: count for what, count in dropped.items() if what != EMPTY}
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= (
-            loaded.cloud.dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
-        )
+        sample.notes |= dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
         if further := find_further_points([name for name in loaded.unused if name not in self.keep]):
@@ -239,6 +240,8 @@ def _load(
         raise (stand_in(path) or error) from None
     column = frame_column(table, wanted)
     cloud = cloud_of_table(table, keep)
+    if isinstance(table, TextTable) and (empty := table.empty_rows):
+        cloud.dropped = {**cloud.dropped, EMPTY: empty}
     cloud.track = name_rows(table, track) if track not in ("", ROWS) else None
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})

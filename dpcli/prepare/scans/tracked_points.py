@@ -21,6 +21,7 @@ from dpcli.store import CloudSequence
 from dpcli.store.views import ViewsReader
 
 ROWS = "rows"
+_WRAP = 1 << 64  # whole numbers of as many bits, with a sign or without, stay apart
 
 
 def with_track(keep: tuple[str, ...], track: str) -> tuple[str, ...]:
@@ -40,7 +41,7 @@ def identify(path: Path, clouds: Sequence[Cloud], track: str, keep: tuple[str, .
     where the frames can't be what ``track`` says.
     """
     if track == ROWS:
-        lost = next((reason for cloud in clouds for reason in cloud.dropped), "")
+        lost = next((reason for cloud in clouds for reason in cloud.dropped if reason.endswith("dropped")), "")
         counts = sorted({len(cloud.points) for cloud in clouds})
         if lost or len(counts) > 1:
             why = f"reading left some out ({lost})" if lost else f"its frames have {counts[0]} to {counts[-1]} points"
@@ -63,18 +64,60 @@ def name_rows(table: Table, track: str) -> np.ndarray:
         )
     place = table.names.index(track)
     try:
-        return _whole(table.path, track, table.columns([place])[:, 0])
+        values = table.columns([place])[:, 0]
     except DataError:
-        words = np.array(table.words(place))
-        if (words == "").any() or any(word[0].isdigit() for word in set(words.tolist())):
-            raise
-        return np.unique(words, return_inverse=True)[1].reshape(-1)
+        return _numbered(table.path, track, table.words(place))
+    if not np.isfinite(values).all() or np.abs(values).max(initial=0) < _exact_below(values.dtype):
+        return _whole(table.path, track, values)
+    try:  # as they are written: the numbers are rounded
+        whole = [int(word) % _WRAP for word in table.words(place)]
+    except ValueError:
+        return _whole(table.path, track, values)
+    return np.array(whole, np.uint64).astype(np.int64)
+
+
+def _numbered(path: Path, track: str, words: list[str]) -> np.ndarray:
+    """Returns a number i64 (N) for each word, the same for the same. Raises DataError where one is missing, or a number."""
+    known = dict.fromkeys(words)
+    name = next((word for word in known if word and not _is_number(word)), "")
+    for word in known:
+        if not word or _is_number(word):
+            raise DataError(
+                f"{path}: --track {track}: expected whole numbers or names, one for every point; found {word!r} beside {name!r}"
+            )
+    return np.unique(np.array(words), return_inverse=True)[1].reshape(-1)
 
 
 def _whole(path: Path, track: str, values: np.ndarray) -> np.ndarray:
+    """Returns numbers as identities i64 (N). Raises DataError where some are no whole ones, or may have been rounded to them."""
+    if values.dtype.kind in "iub":
+        return values.astype(np.int64)  # the greatest of 64 bits become negative, and stay apart
     if not np.isfinite(values).all() or (values != np.floor(values)).any():
         raise DataError(f"{path}: --track {track}: expected a whole number for every point, the same in every frame")
+    limit, most = _exact_below(values.dtype), float(np.abs(values).max(initial=0))
+    if most >= limit:
+        raise DataError(
+            f"{path}: --track {track}: numbers up to {most:.0f} read as {values.dtype}, which doesn't tell whole numbers beyond"
+            f" {limit} apart; write smaller ones, or a column of integers"
+        )
     return values.astype(np.int64)
+
+
+def _exact_below(kind: np.dtype) -> int:
+    """Returns the number up to which a type of floats holds all whole ones.
+
+    >>> _exact_below(np.dtype("float32")), _exact_below(np.dtype("float64"))
+    (16777216, 9007199254740992)
+    """
+    return int(2 ** (np.finfo(kind).nmant + 1))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -112,9 +155,9 @@ class TrackedViews(OwnScans):
 
     @property
     def length_unit(self) -> str:
-        """Returns the unit that the option names, unless it is the default; then the views file's, "" where it tells none."""
+        """Returns the unit that the options name, where one of them is given; else the views file's, "" where it tells none."""
         with ViewsReader(self.raw) as views:
-            return self.unit if self.unit != "m" else views.header.length_unit
+            return self.unit if self.unit != "m" or self.scale is not None else views.header.length_unit
 
     def items(self) -> list[Item]:
         """Returns the one sample, named as the views are. Raises DataError where they have no tracks."""

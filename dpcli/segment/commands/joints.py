@@ -65,6 +65,7 @@ Trees = Iterator[tuple[int, CloudSequence, KinematicTree]]
 
 
 def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:
+    late = []
     with Progress("joints", len(chosen), "sequence") as progress:
         for number, index in enumerate(chosen):
             sequence = reader.read(index)
@@ -72,10 +73,16 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
                 raise DataError(f"{reader.path}: {sequence.name!r} has no point in any part; predict its parts first")
             tree = with_point_axes(sequence, kinematic_tree(sequence, reader.read_parts(index)))
             counts.update(joint_counts(tree))
+            late += [f"part {part} of {sequence.name}" for part in tree.trajectories.ids[~tree.trajectories.seen[0]]]
             if picture is not None and number == 0:
                 joints_picture(picture, tree, sequence.name)
             yield index, sequence, tree
             progress.advance()
+    if late:
+        log.warn(
+            f"{reader.path}: hardly a point in frame 0, so that the place there, and with it the joint, is a guess:"
+            f" {first_names(late)}"
+        )
 
 
 def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpcli.segment.frame_pairs import sequence_scale
+from dpcli.segment.frame_pairs import sequence_scale, without_strays
 from dpcli.segment.kinematics.joint_fit import JointFit
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree
 from dpcli.segment.kinematics.part_trajectories import Trajectories
@@ -46,7 +46,7 @@ class SeenParts:
         rows = [_thinned(frames[t], sequence.part, rng) for t in self._chosen]
         clouds = [sequence.points[own].astype(np.float64) for own in rows]
         self._part = sequence.part[np.concatenate(rows)]
-        self._center = np.concatenate(clouds).mean(0)
+        self._center = np.concatenate([without_strays(cloud) for cloud in clouds]).mean(0)
         self._scale = float(sequence_scale(clouds))
         enough = min(len(own) for own in rows) >= _FEWEST and len(rows) > 1
         self._frames = Frames([(cloud - self._center) * self._scale for cloud in clouds]) if enough else None

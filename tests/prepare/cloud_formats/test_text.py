@@ -18,6 +18,8 @@ from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, fin
 from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, EMPTY, read_text
 from dpcli.prepare.cloud_formats.text_numbers import CUT
 from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.reader import Item
+from dpcli.prepare.scans.assembling import Lengths, assemble
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
 quick = settings(
@@ -241,9 +243,14 @@ def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
 
 
 def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
-    with pytest.raises(DataError, match="column t: float32, .* would round its values by up to 0.1;"):
-        read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,1700000000.0\n1,2,4,1700000000.1\n", keep=["t"])
-    assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
+    clouds = [
+        read(tmp_path / "a.csv", f"x,y,z,t\n1,2,3,{first}\n1,2,4,{second}\n", keep=["t"])
+        for first, second in (("1700000000.0", "1700000000.1"), ("5", "1700000001"))
+    ]
+    item = Item("a", tmp_path / "a.csv")
+    with pytest.raises(DataError, match="a.csv: column t: float32, .* would round its values by up to 0.1;"):
+        assemble(item, clouds[:1], Lengths())
+    assert assemble(item, clouds[1:], Lengths()).sequence.extra["field_t"][0] == 5
 
 
 def test_comments_and_empty_lines_between_rows(tmp_path):

@@ -56,6 +56,70 @@ def test_column_of_table_names_points(tmp_path: Path, words: bool, capfd: pytest
             np.testing.assert_allclose(point, truth[name][t], atol=1e-5)
 
 
+def _with_identities(form: str, place: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    """Writes frames of points and their identities, and returns where they lie."""
+    points, names = (np.concatenate([one[k] for one in frames]) for k in (0, 1))
+    if form == "array":
+        np.savez(place / "all.npz", points=points.reshape(len(frames), -1, 3), id=names.reshape(len(frames), -1))
+        return place / "all.npz"
+    if form == "table":
+        rows = [(t, *row) for t, frame in enumerate(frames) for row in zip(frame[1].tolist(), *frame[0].T.tolist())]
+        (place / "all.csv").write_text("frame,id,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in rows) + "\n")
+        return place / "all.csv"
+    if form == "parquet":
+        arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+        columns = {"frame": np.repeat(np.arange(len(frames)), len(names) // len(frames)), "id": names}
+        table = arrow.table({**columns, **dict(zip("xyz", points.T))})
+        parquet.write_table(table, place / "all.parquet")
+        return place / "all.parquet"
+    (place / "scan").mkdir()
+    for t, (cloud, own) in enumerate(frames):
+        np.savez(place / "scan" / f"{t}.npz", points=cloud, id=own)
+    return place / "scan"
+
+
+@pytest.mark.parametrize("form", ["array", "table", "parquet", "folder"])
+@pytest.mark.parametrize("first", [-5, 2**24, 2**53, 2**62])
+def test_identities_that_floats_would_round_stay_apart(tmp_path: Path, form: str, first: int) -> None:
+    points = _moving(np.random.default_rng(7))
+    names = [first + 4 * np.arange(_POINTS) + t % 2 for t in range(_FRAMES)]  # others in every second frame
+    raw = _with_identities(form, tmp_path, list(zip(points, names)))
+    assert 0 == exit_code("prepare", "clouds", raw, "--track", "id", "-o", tmp_path / "out.h5")
+    with CloudsReader(tmp_path / "out.h5") as clouds:
+        assert clouds.read(0).track.tolist() == np.concatenate(names).tolist()
+
+
+def test_rounded_identities_and_missing_names_are_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+    points = _moving(np.random.default_rng(8))
+    names = [np.float32(2**24 + 2 * np.arange(_POINTS))] * _FRAMES
+    command = ("prepare", "clouds", "-o", tmp_path / "out.h5", "--track", "id")
+    raw = _with_identities("folder", tmp_path, list(zip(points, names)))
+    assert "doesn't tell whole numbers beyond 16777216 apart" in refused(*command, raw)
+    for missing in ("", "nan", "-0.5"):
+        words = np.array([f"{k}_left" for k in range(_POINTS - 1)] + [missing])
+        raw = _with_identities("table", tmp_path, [(cloud, words) for cloud in points])
+        assert f"one for every point; found {missing!r} beside '0_left'" in refused(*command, raw)
+
+
+@pytest.mark.parametrize("sampling", ["random", "fps", "voxel"])
+def test_thinned_frames_keep_the_same_points(tmp_path: Path, sampling: str) -> None:
+    points = _moving(np.random.default_rng(9))
+    hidden = np.random.default_rng(10).random((_FRAMES, _POINTS)) < 0.2
+    points[hidden] = np.nan
+    np.save(tmp_path / "all.npy", points)
+    words = ("--track", "rows", "--points", "5", "--sampling", sampling)
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "all.npy", *words, "-o", tmp_path / "out.h5")
+    with CloudsReader(tmp_path / "out.h5") as clouds:
+        sequence = clouds.read(0)
+    assert np.diff(sequence.frame_offsets).tolist() == [5] * _FRAMES
+    known: set[int] = set()
+    for t, own in enumerate(sequence.track.reshape(_FRAMES, 5)):
+        np.testing.assert_array_equal(sequence.frame(t), points[t, own])
+        seen = known - set(np.flatnonzero(hidden[t]).tolist())
+        assert seen <= set(own.tolist()) if len(seen) <= 5 else set(own.tolist()) <= seen
+        known |= set(own.tolist())
+
+
 def test_rows_name_points_though_some_are_no_measurement(tmp_path: Path) -> None:
     points = _moving(np.random.default_rng(4))
     points[2, 5] = np.nan
@@ -71,6 +135,27 @@ def test_rows_name_points_though_some_are_no_measurement(tmp_path: Path) -> None
         assert np.diff(sequence.frame_offsets).tolist() == [12, 12, 11, 12, 12]
         frame = np.repeat(np.arange(_FRAMES), np.diff(sequence.frame_offsets))
         np.testing.assert_array_equal(sequence.points, points[frame, sequence.track])
+
+
+def test_rows_of_tables_that_hold_nothing_are_counted(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    points = _moving(np.random.default_rng(11))
+    rows = [f"{s},{t},{x},{y},{z}" for s in "ab" for t in range(_FRAMES) for x, y, z in points[t].tolist()]
+    for t in range(_FRAMES):  # each frame of the first sequence lacks another point
+        rows[t * _POINTS + t] = ",,,,"
+    (tmp_path / "all.csv").write_text("recording,frame,x,y,z\n" + "\n".join(rows) + "\n")
+    command = ("prepare", "clouds", tmp_path / "all.csv", "--sequence-column", "recording", "-o", tmp_path / "out.h5")
+    assert 0 == exit_code(*command)
+    assert "rows with nothing between their delimiters dropped: 5" in capfd.readouterr().err
+    assert exit_code(*command, "--track", "rows", "--force")
+    assert "reading left some out (rows with nothing" in capfd.readouterr().err
+
+
+def test_rows_with_few_digits_are_the_same_points(tmp_path: Path) -> None:
+    points = 1e6 * _moving(np.random.default_rng(12)) + 5e6
+    for t, frame in enumerate(points):
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        np.savetxt(tmp_path / "scan" / f"{t}.xyz", frame, fmt="%.5e")
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "scan", "--track", "rows", "-o", tmp_path / "out.h5")
 
 
 def test_what_cannot_be_an_identity_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
@@ -109,6 +194,11 @@ def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., st
         np.testing.assert_array_equal(sequence.part.reshape(4, 200), np.tile(views.part, (4, 1)))
         np.testing.assert_array_equal(sequence.track.reshape(4, 200), np.tile(np.arange(200), (4, 1)))
         np.testing.assert_array_equal(sequence.time, views.header.time)
+    scaled = ("prepare", "clouds", tmp_path / "views.h5", "-o", tmp_path / "scaled.h5", "--scale", "1000")
+    assert 0 == exit_code(*scaled)
+    with CloudsReader(tmp_path / "scaled.h5") as clouds:  # as of other inputs: `--unit` names it, by default meters
+        assert clouds.length_unit == "m"
+        np.testing.assert_allclose(clouds.read(0).points, sequence.points / 1000, rtol=1e-6)
     assert 0 == exit_code(
         "prepare", "synthetic", "animal", "-o", tmp_path / "bare.h5", "--size", "16", "--frames", "2", "--tracks", "0"
     )

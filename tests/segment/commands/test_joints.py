@@ -17,6 +17,7 @@ from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code
+from tests.support.drawers import drawer, predicted
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -230,6 +231,17 @@ def test_a_unit_that_no_table_knows_is_told_once_where_meters_are_written(output
     find_joints(str(tmp_path / "p.h5"), tmp_path / output, sequence=None, picture=None, force=False)
     said = [line for line in capsys.readouterr().err.splitlines() if "unit of length" in line]
     assert len(said) == warned and all(repr(unit) in line or "not given" in line for line in said)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_part_that_frame_0_does_not_show_is_told(hidden, tmp_path, capsys):
+    seeds = (0, 1 + hidden)  # others, since `found_once` doesn't look at parts
+    sequences = [drawer(name, seed) for name, seed in zip(("first", "second"), seeds)]
+    if hidden:
+        sequences[1].part[: sequences[1].frame_offsets[1]] = 0
+    said = predicted(tmp_path / "parts.h5", sequences)
+    find_joints(str(said), tmp_path / "joints.json", sequence=None, picture=None, force=False)
+    assert ("is a guess: part 1 of second\n" in capsys.readouterr().err) == hidden
 
 
 def test_one_frame_has_no_joints(tmp_path):

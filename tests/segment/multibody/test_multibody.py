@@ -111,6 +111,24 @@ def test_units_and_places_change_nothing_much(unit, place):
     assert agreement(labels, chest()) > 0.9
 
 
+@pytest.mark.parametrize(("keep", "away"), [(False, 3.0), (False, 1e5), (True, 3.0)])
+@pytest.mark.parametrize("strays", [1, 4])
+def test_stray_points_do_not_make_the_object_tiny(strays, keep, away):
+    """Such as flying pixels of a depth camera; as the farthest points, they once said how large the object is."""
+    sequence = chest(keep=keep)
+    far = np.random.default_rng(strays).normal(size=(strays, 3)) * 0.3 * away + away
+    clouds, parts = [sequence.frame(t) for t in range(4)], np.split(sequence.part, sequence.frame_offsets[1:-1])
+    tracks = np.split(sequence.track, sequence.frame_offsets[1:-1]) if keep else None
+    for t in (1, 2):
+        clouds[t], parts[t] = np.float32(np.concatenate([clouds[t], far + t])), np.append(parts[t], np.full(strays, -1))
+        if keep:
+            tracks[t] = np.append(tracks[t], 1000 + 10 * t + np.arange(strays))
+    given = CloudSequence.from_frames("chest", clouds, part=parts, **({"track": tracks} if keep else {}))
+    labels, _ = predicted(given)
+    known = given.part >= 0
+    assert rand_index(torch.tensor(labels[known]), torch.tensor(np.int64(given.part[known]))) > 0.9
+
+
 def test_one_motion_stays_one_part():
     rng = np.random.default_rng(1)
     clouds = []
