@@ -13,6 +13,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
+from dpcli.prepare.decode.cloud_files import MESHES
 from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
@@ -39,6 +40,7 @@ _MARKERS = ".trc"  # tables of markers, which are read only where that is asked 
 _NOTES = (".json", ".yaml", ".yml", ".xml", ".toml")  # that may tell poses, times or labels
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
 _TABLE = "write a table with a row for each frame and columns such as hip_x, hip_y, hip_z, and give --track columns"
+_ANIMATED = "save their frames as .obj with the same vertices, or export glTF 2.0, which `dpc prepare animation` reads"
 _ADVICE = {
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst", ".tar", ".tgz"), "unpack them"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
@@ -49,6 +51,10 @@ _ADVICE = {
     ".c3d": "export them as .trc or .csv, and give --track columns",
     **dict.fromkeys((".bvh", ".asf", ".amc"), f"they hold angles of joints: compute where these are, and {_TABLE}"),
     **dict.fromkeys((".skeleton", ".json"), f"if they hold joints, {_TABLE}"),
+    **dict.fromkeys((".abc", ".usd", ".usda", ".usdc", ".usdz", ".blend", ".fbx"), _ANIMATED),
+    **dict.fromkeys(
+        (".glb", ".gltf"), "where one is animated, `dpc prepare animation` reads it; else save their points as .ply"
+    ),
     **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
 }
 
@@ -75,6 +81,8 @@ def find_sequences(
     if not found:
         others = Counter({suffix: count for suffix, count in foreigners.items() if suffix not in _NOTES})
         others = others or Counter({suffix: count for suffix, count in foreigners.items() if suffix in _ADVICE})
+        if any(others[suffix] for suffix in MESHES) and tuple(suffixes) != MESHES:
+            return find_sequences(root, MESHES, pattern=pattern, table=table)
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
@@ -117,11 +125,11 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: l
 def refuse_file(path: Path, suffixes: Sequence[str]) -> None:
     """Raises DataError where a path is one file, a cloud or of a format that is not read, and says what to do with it."""
     suffix = path.suffix.lower()
-    if suffix in (*_FOREIGN, ".json") and suffix != _MARKERS and path.is_file():
+    if suffix in (*_FOREIGN, ".json") and suffix not in (_MARKERS, *MESHES) and path.is_file():
         advice = _advice([suffix])
         end = "" if "--track" in advice else ", and name their folder or table"
         raise DataError(f"{path}: {suffix} files are not read: {advice}{end}")
-    if is_cloud(path.name, suffixes) and path.is_file():
+    if is_cloud(path.name, (*suffixes, *MESHES)) and path.is_file():
         raise DataError(f"{path}: one cloud; expected a folder, whose files are the frames of a sequence")
 
 
@@ -142,7 +150,7 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        foreign = count_suffixes(names, (*_FOREIGN, _MARKERS, *_NOTES))
+        foreign = count_suffixes(names, tuple(one for one in (*_FOREIGN, _MARKERS, *_NOTES) if one not in suffixes))
         if clouds or foreign:
             yield Path(folder), clouds, foreign
 

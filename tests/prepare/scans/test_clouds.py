@@ -266,7 +266,10 @@ def test_what_else_lies_there_is_named(tmp_path):
     for rest in ("a/0.bag", "b/0.bag.active"):
         (tmp_path / rest).unlink()
     (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
-    with pytest.raises(DataError, match="found 1 .gz file, 1 .obj file: unpack them, or save their points as .ply"):
+    reader = CloudFolders(tmp_path)
+    assert reader.summary(reader.items())[1] == "a: its frames are 0.obj; left out: 1 .gz file"
+    (tmp_path / "a" / "0.obj").rename(tmp_path / "a" / "0.stl")
+    with pytest.raises(DataError, match="found 1 .gz file, 1 .stl file: save their points as .ply, or unpack them"):
         CloudFolders(tmp_path).items()
     (tmp_path / "a.xlsx").write_bytes(b"PK")
     with pytest.raises(DataError, match="a.xlsx: .xlsx files are not read: save their sheets as .csv"):
