@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cloud_files import MESHES
-from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
+from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
 from dpcli.prepare.times_beside import with_times
@@ -31,7 +31,7 @@ _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
-    " .ksplat .sog .oni .klg"
+    " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
     " .c3d .bvh .asf .amc .skeleton"
     " .bag .mcap .db3 .active .bz2 .xz .zst .tar .tgz".split()
@@ -45,6 +45,8 @@ _ADVICE = {
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst", ".tar", ".tgz"), "unpack them"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
     ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
+    ".nc": "call them .h5 if they are netCDF 4, which is HDF5; else save their arrays as .npy",
+    ".zarr": "save their arrays as .npy",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
     _MARKERS: "give --track columns",
@@ -146,11 +148,13 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
     """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
     are not read, by suffix; no folder that has neither.
     """
-    for folder, _, names in walk_folders(root):
+    for folder, below, names in walk_folders(root):
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        foreign = count_suffixes(names, tuple(one for one in (*_FOREIGN, _MARKERS, *_NOTES) if one not in suffixes))
+        foreign = count_suffixes(
+            [*names, *stores(below)], tuple(one for one in (*_FOREIGN, _MARKERS, *_NOTES) if one not in suffixes)
+        )
         if clouds or foreign:
             yield Path(folder), clouds, foreign
 
