@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +21,8 @@ from dpcli.text_files import decode_text
 COLUMNS = "columns"
 _LOOKED_AT = 30  # lines among which the names are looked for
 _UNIT = re.compile(r"(length[ _]?)?units?:?", re.IGNORECASE)
+_COUNT = re.compile(r"NumFrames|Total Exported Frames", re.IGNORECASE)
+MISSING = "frames missing that the head of their table counts; is the copy whole?"
 _NO_PLACES = frozenset(  # words of columns in threes that are no place of a point
     "velocity velocities vel speed acceleration accelerations acc accel gyro gyroscope gyr magnetometer mag imu jerk"
     " rotation rotations rot quaternion quaternions quat orientation orientations euler angle angles angular linear"
@@ -32,12 +34,13 @@ _NO_PLACES = frozenset(  # words of columns in threes that are no place of a poi
 @dataclass(frozen=True)
 class WideTable:
     """Holds a table and which of its columns are points. trios: the places of x, y and z of each, i64 (M,3); unit: of the
-    coordinates, "" where nothing tells it.
+    coordinates, "" where nothing tells it; missing: how many rows fewer there are than the lines above the names count.
     """
 
     table: TextTable | ParquetTable
     trios: np.ndarray
     unit: str
+    missing: int = 0
 
     def cloud(self, keep: Sequence[str]) -> Cloud:
         """Returns the points of all rows, M after M, with the place of each in its row as its identity."""
@@ -47,7 +50,9 @@ class WideTable:
         names = tuple(self.table.names[place] for place in self.trios.ravel())
         identities = np.tile(np.arange(len(self.trios)), len(values))
         rest = without([name for name in self.table.names if name], names)
-        return Cloud(values.reshape(-1, 3), unit=self.unit, columns=names, unread=rest, track=identities)
+        dropped = {MISSING: self.missing} if self.missing else {}
+        points = values.reshape(-1, 3)
+        return Cloud(points, unit=self.unit, columns=names, unread=rest, dropped=dropped, track=identities)
 
     def rows(self) -> list[Rows]:
         """Returns the one sequence of a table without a column of frames: its rows as they come."""
@@ -82,7 +87,7 @@ def read_wide(path: Path) -> WideTable:
         above = _of_columns(head[:number])
         width = max(map(len, (*above, names)))  # the lowest cell of the last column may be empty
         told = [[row[place] if place < len(row) else "" for row in (*above, names)] for place in range(width)]
-        named = tuple(next((word for word in reversed(words) if word), "") for words in told)
+        named = _named(told)
         unit, start = _unit_above(head[:number]), number + 1
         while start < len(lines) and not lines[start].strip():
             start += 1
@@ -91,7 +96,9 @@ def read_wide(path: Path) -> WideTable:
             unit, start = one_unit(units), start + 1
         body = "\n".join(lines[start:])
         delimiter = delimiter_of(body.split("\n", 1)[0].strip(" \r"))
-        return _checked(path, TextTable(path, named, body, start + 1, delimiter), told, unit)
+        table = TextTable(path, named, body, start + 1, delimiter)
+        counts = [int(word) for word in _told_above(head[:number], _COUNT) if word.isdecimal()]
+        return replace(_checked(path, table, told, unit), missing=max(max(counts, default=0) - table.rows, 0))
     raise DataError(f"{path}: --track columns: no columns of several points, such as hip_x, hip_y, hip_z, knee_x, ...")
 
 
@@ -138,6 +145,13 @@ def _trios(told: list[list[str]]) -> list[tuple[int, int, int]]:
     return sorted(trio for trio, own in zip(found, words) if not own & _NO_PLACES)
 
 
+def _named(told: list[list[str]]) -> tuple[str, ...]:
+    """Returns the lowest name of each column, with those above it where several columns have the same."""
+    filled = [[word for word in words if word] for words in told]
+    counts = Counter(words[-1] for words in filled if words)
+    return tuple(" ".join(words if words and counts[words[-1]] > 1 else words[-1:]) for words in filled)
+
+
 def _of_columns(head: list[list[str]]) -> list[list[str]]:
     """Returns those of the lines above the names that tell of the columns: behind the last empty line, and not of the unit."""
     start = max((number + 1 for number, row in enumerate(head) if not any(row)), default=0)
@@ -145,10 +159,14 @@ def _of_columns(head: list[list[str]]) -> list[list[str]]:
 
 
 def _unit_above(head: list[list[str]]) -> str:
-    """Returns the unit that the lines above the names tell, behind or below a cell such as ``Length Units``; "" without."""
+    """Returns the unit that the lines above the names tell; "" where they tell none."""
+    return next((unit for word in _told_above(head, _UNIT) if (unit := unit_of(f"x {word}"))), "")
+
+
+def _told_above(head: list[list[str]], what: re.Pattern[str]) -> list[str]:
+    """Returns the cells behind and below those of the lines above the names that say ``what`` they tell, as ``Length Units``."""
+    found = []
     for row, below in zip(head, [*head[1:], []]):
-        for place, cell in enumerate(row):
-            if _UNIT.fullmatch(cell):
-                told = [*row[place + 1 : place + 2], *below[place : place + 1]]
-                return next((unit for word in told if (unit := unit_of(f"x {word}"))), "")
-    return ""
+        for place in (place for place, cell in enumerate(row) if what.fullmatch(cell)):
+            found += [*row[place + 1 : place + 2], *below[place : place + 1]]
+    return found

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dpcli.prepare.scans.tables import TableSequences
+from dpcli.prepare.wide_tables import MISSING
 from dpcli.store import CloudsReader
 from tests.support.commands import told
 
@@ -111,10 +112,23 @@ def test_every_point_of_every_row_is_read(
     frame = np.repeat(np.arange(_FRAMES), np.diff(sequence.frame_offsets))
     assert len(frame) == _FRAMES * _MARKERS - 2
     np.testing.assert_allclose(sequence.points, points[frame, sequence.track], atol=1e-5)
+    if name == "take.csv":
+        assert "not read: Rigid Body Box Rotation X, Rigid Body Box Rotation Y," in " ".join(said.stderr.split())
     if timed:
         np.testing.assert_allclose(sequence.time, np.arange(_FRAMES) / 100, atol=1e-9)
     else:
         assert sequence.time is None
+
+
+@pytest.mark.parametrize(("name", "write"), [("walk.trc", _trc), ("take.csv", _motive)])
+def test_frames_that_the_head_counts_and_that_are_missing_are_told(
+    tmp_path: Path, name: str, write: Callable[[np.ndarray], str]
+) -> None:
+    text = write(_moving())
+    for lost in (0, 2):
+        (tmp_path / name).write_text("\n".join(text.split("\n")[: -lost or None]))
+        reader = TableSequences(tmp_path / name, track="columns")
+        assert reader.read(reader.items()[0], np.random.default_rng()).notes.get(MISSING, 0) == lost
 
 
 def test_sequences_of_a_wide_table_are_told_apart(tmp_path: Path) -> None:
