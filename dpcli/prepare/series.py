@@ -81,6 +81,12 @@ class Series:
         """Returns the running numbers in the names, i64 (F), rising; None when the names hold none, or more than one."""
         return NumberColumns(parse_names(self.names)).running_numbers() if self.numbered else None
 
+    def _is_counted(self) -> bool:
+        """Returns whether the names hold a number that counts the frames beside another, such as a time."""
+        numbers = self.numbers()
+        several = len(NumberColumns(parse_names(self.names)).varying()) > 1
+        return several and numbers is not None and int(np.diff(numbers).min()) == 1
+
     def name_times(self) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (F), rising, where the names are times; None when they are not."""
         return NumberColumns(parse_names(self.names)).times() if self.numbered else None
@@ -96,7 +102,7 @@ class Series:
         """
         if fps is None:
             return self.times()
-        numbers = None if self.name_times() is not None else self.numbers()
+        numbers = None if self.name_times() is not None and not self._is_counted() else self.numbers()
         places = np.arange(len(self.names)) if numbers is None else _evenly(numbers)
         return places / fps
 

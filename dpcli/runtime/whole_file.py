@@ -183,11 +183,13 @@ def make_folder(folder: Path, option: str = "-o") -> None:
         ) from None
 
 
-def refuse_broken_link(folder: Path, option: str = "-o") -> None:
-    """Raises DataError where a folder, or one above it, is a link to nowhere: it neither exists nor can be made."""
-    for one in (folder, *folder.parents):
+def refuse_broken_link(output: Path, option: str = "-o") -> None:
+    """Raises DataError where an output, or a folder above it, is a link to nowhere: a folder can't be made there, and a file would
+    take the place of the link.
+    """
+    for one in (output, *output.parents):
         if one.is_symlink() and (reason := why_unreadable(one)):
-            raise DataError(f"{option} {folder}: {one} is {reason}; remove the link, or name another place")
+            raise DataError(f"{option} {output}: {one} is {reason}; remove the link, or name another place")
 
 
 def check_regular(path: Path, option: str = "-o") -> None:
@@ -198,6 +200,8 @@ def check_regular(path: Path, option: str = "-o") -> None:
         raise UsageError(f"{option} -: goes through no pipe here; name a file or folder")
     target = os.readlink(path) if path.is_symlink() else ""
     handle = target.startswith("/proc/") or os.path.realpath(path.parent).startswith("/proc/")
+    if not handle:
+        refuse_broken_link(path, option)
     if handle or (path.exists() and not path.is_file() and not path.is_dir()):
         raise UsageError(f"{option} {path}: is not a regular file; to write into a pipe use `-o - | ...`")
 

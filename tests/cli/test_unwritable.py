@@ -161,6 +161,10 @@ LOST = [
     "prepare split c.h5 --fractions 0.5,0,0.5 -o lost/below",
     "generate4d fit c.h5 c.h5 -o lost/",
     "evaluate weights fetch alexnet --weights lost",
+    "prepare synthetic gestures -o lost",
+    "prepare merge c.h5 -o round --force",
+    "info c.h5 --page lost",
+    "prepare split c.h5 --fractions 0.5,0,0.5 -o lost.h5",
 ]
 
 
@@ -169,11 +173,12 @@ def test_an_output_folder_that_is_a_link_to_nowhere_is_named(line, folder, tmp_p
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(folder / "c.h5", "c.h5")
     Path("lost").symlink_to("nowhere")
+    Path("lost.h5").symlink_to("nowhere")
     Path("round").symlink_to("round")
     done = dpc_here(*line.split())
     words = (" is a link to nowhere, which is missing", " is a link in a circle")["round" in line]
     assert done.returncode == 3 and f"{words}; remove the link, or name another place" in done.stderr.decode()
-    assert sorted(os.listdir()) == ["c.h5", "lost", "round"]
+    assert sorted(os.listdir()) == ["c.h5", "lost", "lost.h5", "round"]
 
 
 def test_pictures_and_runs_in_a_folder_that_is_a_link_to_nowhere(tmp_path):

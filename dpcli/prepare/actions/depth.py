@@ -34,7 +34,7 @@ from dpcli.prepare.decode.depth_files import (
     read_depth_video,
     require_depth,
 )
-from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
+from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -60,7 +60,7 @@ _OTHER_PICTURES = re.compile(
 _CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz")  # points, not pictures
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
-    " .svo2 .r3d .sens .xef .klg .dat .pkl".split()
+    " .svo2 .r3d .sens .xef .klg .dat .pkl .vrs .rrd .nc .zarr".split()
 )
 _HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
@@ -356,7 +356,7 @@ def _not_read(root: Path, clips: Collection[Path]) -> list[str]:
         if where and not below and not any(not is_hidden(name) for name in names):
             told.append(f"{where[:-1]} (empty)")
         below[:] = [name for name in below if Path(folder, name) not in clips]
-        found = count_suffixes(names, _FOREIGN)
+        found = count_suffixes([*names, *stores(below)], _FOREIGN)
         told += [f"{where}{counted(count, f'{suffix} file')}" for suffix, count in sorted(found.items())]
     return sorted(told, key=natural_key)
 
@@ -391,7 +391,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        below = (name for _, _, files in walk_folders(path) for name in files)
+        below = (name for _, folders, files in walk_folders(path) for name in (*files, *stores(folders)))
         there = count_suffixes(below, (*_FOREIGN, *_CLOUDS))
         seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(there.items()))
         clouds = not any(suffix.endswith(_FOREIGN) for suffix in there)

@@ -18,6 +18,13 @@ _STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per
 _SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
 _MARKED, _WELL_BELOW = 0.005, 0.97  # share of pixels that hold a mark; up to where the others reach then
 _FAR_BELOW = 0.25  # up to where they reach where the mark is no largest number of some bits
+_WIDE, _SPARSE = (
+    3,
+    0.5,
+)  # width by height, and share of pixels with a depth, of a lidar's points drawn into a street's picture
+LIKE_KITTI = (
+    "videos of wide pictures with few depths; if they are KITTI's, 256 units are a meter: give --depth-scale 256"
+)
 _ROWS = 16  # of a frame that are looked at
 
 
@@ -80,10 +87,14 @@ def _roughness(rows: np.ndarray) -> float:
 
 def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
-    in millimeters; the low bits of 8 may hold flags.
+    in millimeters; the low bits of 8 may hold flags. Or when they are wide pictures with few depths, as KITTI has them of its
+    lidar.
     """
     if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
         return {}
+    middle = frames[len(frames) // 2]
+    if middle.shape[1] >= _WIDE * middle.shape[0] and np.count_nonzero(middle) < _SPARSE * middle.size:
+        return {LIKE_KITTI: 1}
     some = _some_depths(frames)
     if _mark(some) or _kinds(some) <= _KINDS:
         return {}

@@ -41,6 +41,7 @@ _FRAME = re.compile(
     re.IGNORECASE,
 )
 
+ROWS_ARE_FRAMES = "where a row is a frame, and three columns each are a point, give --track columns"
 _RECORDING = re.compile(
     r"#?(sequence|seq|recording|record|rec|video|take|trial|session|run|clip|episode|scene|file)s?"
     r"[ _.-]?(id|ids|no|nr|num|number|idx|index|name|#|№)?[.]?",
@@ -77,11 +78,11 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
             )
         if all(found):
             units = {ranked[0][places[0]][2] for places in found}  # type: ignore[index]
-            return [places[0] for places in found], _one_unit(units)
+            return [places[0] for places in found], one_unit(units)
     for axes in ranked[1:]:
         found = [[place for place, axis in enumerate(axes) if axis == k] for k in range(3)]
         if all(len(places) == 1 for places in found):
-            return [places[0] for places in found], _one_unit({unit_of(names[places[0]]) for places in found})
+            return [places[0] for places in found], one_unit({unit_of(names[places[0]]) for places in found})
     return None
 
 
@@ -106,7 +107,8 @@ def unit_of_comments(lines: Iterable[str]) -> str:
     return told.pop() if len(told) == 1 else ""
 
 
-def _one_unit(units: set[str]) -> str:
+def one_unit(units: set[str]) -> str:
+    """Returns the only one of the units. Raises DataError where there are several."""
     if len(units) > 1:
         raise DataError(f"x, y and z have different units ({', '.join(sorted(unit or 'none' for unit in units))})")
     return units.pop()

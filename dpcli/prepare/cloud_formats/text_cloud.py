@@ -1,4 +1,4 @@
-"""Clouds in texts: columns with names, or x y z first."""
+"""Clouds in texts: columns with names, or x y z first; and the vertices of meshes in texts."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from dpcli.prepare.cloud_formats.cloud import (
 )
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_numbers import COMMENTS, TextTable, read_text_table
+from dpcli.text_files import decode_text
 
 _MARK = re.compile(
     r"\b(frame|scan|sweep|step|cloud|time|time_?stamp|t)\b[\s_.:=#]*(id|no|number|index)?[\s:=#]*\d", re.IGNORECASE
@@ -50,6 +51,45 @@ def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     refuse_frames(table)
     _refuse_marked_frames(table)
     return _counted(cloud_of_table(table, keep), table)
+
+
+def read_vertices(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Returns the vertices of an OBJ or OFF file as a cloud, in the order in which they stand there, whatever its faces do with
+    them; with the colors that stand behind the places in an OBJ. Raises DataError where they can't be read.
+    """
+    if keep:
+        raise DataError(f"{path}: --keep-fields {keep[0]}: the numbers of its vertices have no names")
+    lines = (line.partition("#")[0].split() for line in decode_text(path).split("\n"))
+    found = [words for words in lines if words]
+    is_obj = path.suffix.lower() == ".obj"
+    rows = [words[1:] for words in found if words[0] == "v"] if is_obj else _rows_of_off(path, found)
+    if is_obj and not rows:
+        raise DataError(f"{path}: no vertices (lines such as v 0.1 0.2 0.3)")
+    try:
+        values = np.array(rows, np.float64).reshape(len(rows), len(rows[0]) if rows else len("xyz"))
+    except ValueError:
+        raise DataError(
+            f"{path}: its vertices are no rows of as many numbers each; truncated, or with decimal commas?"
+        ) from None
+    require_columns(path, *values.shape)
+    colored = is_obj and values.shape[1] in (6, 7)
+    unread = unnamed_columns(7 if colored else 4, values.shape[1])
+    return Cloud(values[:, :3], values[:, 3:6] if colored else None, unread=unread)
+
+
+def _rows_of_off(path: Path, found: list[list[str]]) -> list[list[str]]:
+    """Returns the words of the vertices' rows of an OFF file. Raises DataError where it holds other counts than it says."""
+    first, *rows = found or [[""]]
+    counts, rows = (first[1:], rows) if len(first) > 1 else (rows[0] if rows else [], rows[1:])
+    if not re.fullmatch(r"(ST)?C?N?OFF", first[0]) or len(counts) < 2 or not all(map(str.isdecimal, counts[:2])):
+        raise DataError(f"{path}: no OFF file in text; expected OFF, the numbers of vertices and faces, and their rows")
+    vertices, faces = map(int, counts[:2])
+    if len(rows) != vertices + faces:
+        raise DataError(
+            f"{path}: truncated or damaged: its header counts {vertices + faces} vertices and faces, it holds {len(rows)};"
+            " copy it again"
+        )
+    return rows[:vertices]
 
 
 def _counted(cloud: Cloud, table: TextTable) -> Cloud:

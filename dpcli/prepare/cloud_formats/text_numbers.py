@@ -14,7 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
-from dpcli.prepare.cloud_formats.column_names import find_trios, unit_of, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, find_trios, unit_of, unit_of_comments
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 from dpcli.text_files import decode_text
 
@@ -280,7 +280,7 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
     if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
         table = _without_count(table, *rows)
         rows = rows[1:] or rows
-    table = _with_row_names(replace(table, delimiter=delimiter or _delimiter(rows[0][1])), rows)
+    table = _with_row_names(replace(table, delimiter=delimiter or delimiter_of(rows[0][1])), rows)
     return table if names else _checked_unnamed(_with_counted_header(table))
 
 
@@ -290,7 +290,7 @@ def _with_units(table: TextTable) -> TextTable:
     axes = named_axes(table.path, table.names) if row else None
     if not row or not axes:
         return table
-    units = dict(enumerate(_names(row[1].strip(_EDGES), table.delimiter or _delimiter(row[1]))))
+    units = dict(enumerate(names_in(row[1].strip(_EDGES), table.delimiter or delimiter_of(row[1]))))
     told = {unit_of(f"x {units.get(place, '')}") for place in axes[0]}
     if len(told) != 1 or not (unit := told.pop()):
         return table
@@ -325,14 +325,14 @@ def _with_counted_header(table: TextTable) -> TextTable:
 def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None) -> tuple[int, list[str]]:
     """Returns the line where the rows begin, from 1, and the names of their columns, [] without."""
     for number, line in head[:_LOOKED_AT]:
-        names = _names(line, delimiter)
+        names = names_in(line, delimiter)
         if names and named_axes(path, names) is not None:
             return number + 1, names
     number, line = next((one for one in head if not one[1].startswith(COMMENTS)), head[0])
     if not all(
         re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
     ):
-        words = _names(line, delimiter) or line.split()
+        words = names_in(line, delimiter) or line.split()
         raise DataError(
             f"{path}:{number}: columns {', '.join(words)[:80]}; expected x, y and z among them, or numbers only{_advice(words)}"
         )
@@ -345,7 +345,7 @@ def _advice(words: list[str]) -> str:
     if {"lat", "lon"} <= known:
         return "; project latitudes and longitudes to meters first"
     if len(find_trios(words)) > 1:
-        return "; a row holds one point: write a row for each of them"
+        return f"; a row holds one point: write a row for each of them, or, {ROWS_ARE_FRAMES}"
     angles = known & {"azi", "ele", "the", "phi", "ang"}
     return (
         "; compute x, y and z of the angles and distances first"
@@ -354,7 +354,7 @@ def _advice(words: list[str]) -> str:
     )
 
 
-def _names(line: str, delimiter: str | None) -> list[str]:
+def names_in(line: str, delimiter: str | None) -> list[str]:
     """Returns the cells of a line as names, without the sign of a comment."""
     line = re.sub(r"^(#|//|%)+\s*", "", line)
     sign = delimiter or next((d for d in "\t;,|" if d in line), None)
@@ -368,7 +368,7 @@ def _rough_cells(line: str) -> list[str]:
     return [cell for cell in re.split(r"[\s;,|\"']+", line) if cell]
 
 
-def _delimiter(line: str) -> str | None:
+def delimiter_of(line: str) -> str | None:
     """Returns what separates the cells of a row; None for blanks. Commas between blanks are decimal ones, but for those behind
     all cells but the last.
     """

@@ -14,7 +14,7 @@ from dpcli.prepare.cloud_formats.parquet import read_parquet
 from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
-from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.cloud_formats.text_cloud import read_text, read_vertices
 from dpcli.prepare.decode.e57_files import read_e57
 from dpcli.runtime.clips.other_files import stand_in
 
@@ -42,6 +42,7 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".mat": read_mat,
     ".e57": read_e57,
 }
+MESHES = (".obj", ".off")  # whose vertices are read where there is nothing else
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 
 
@@ -60,6 +61,8 @@ def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] =
 
 
 def _read(path: Path, bin_columns: int | None, keep: Sequence[str]) -> Cloud:
+    if path.suffix.lower() in MESHES:
+        return read_vertices(path, keep)
     if path.suffix.lower() != ".bin":
         return _READERS[path.suffix.lower()](path, keep)
     if keep:

@@ -44,6 +44,7 @@ WHITE_AT_ZERO = (
 )
 _PHOTOMETRIC = 262  # the tag of TIFF that says so
 LEFT_OUT = "frames without bytes, which the recording program left out"
+TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
 
@@ -118,7 +119,7 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
     Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
     """
     from dpcli.prepare.decode.deep_video import deep_frames  # for videos alone: folders of images start without it
-    from dpcli.prepare.decode.video_streams import depth_stream
+    from dpcli.prepare.decode.video_streams import depth_stream, how_shown
 
     capture = _opened(path)
     try:
@@ -139,10 +140,11 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
             f"{path}: its depth is stream {stream.place} ({stream.described()}) of several; copy it to a file of its own:"
             f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
         )
+    turned = how_shown(path, stream.place)[1]
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
     times = rising_times([seconds for _, seconds in kept], rate, stride)
     return (
-        [frame for frame, _ in kept],
+        [np.rot90(frame, turned) for frame, _ in kept],
         times,
         0 if stream.place else _missing(path, declared, len(kept), times, stride),
     )
@@ -194,7 +196,8 @@ def _decoded(
     capture, path: Path, start: int, stop: int | None, stride: int, stamps: list[float | None] | None = None
 ) -> Iterator[np.ndarray]:
     """Yields the wanted frames (H,W), and appends the seconds of their time stamps to ``stamps``."""
-    cv2, index = load_cv2(), 0
+    cv2, index, last, repeats = load_cv2(), 0, None, False
+    _require_progressive(path, every=False)
     while (stop is None or index < stop) and capture.grab():
         if index >= start and (index - start) % stride == 0:
             if stamps is not None:
@@ -206,8 +209,24 @@ def _decoded(
                 raise DataError(
                     f"{path}: frame {index} is colored; expected a depth video whose gray is the depth, not a picture of it"
                 )
-            yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
+            gray = np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
+            if not repeats and last is not None and np.array_equal(last, gray):
+                _require_progressive(path, every=True)
+                repeats = True
+            last = gray
+            yield gray
         index += 1
+
+
+def _require_progressive(path: Path, *, every: bool) -> None:
+    """Raises DataError for interlaced frames, which some versions of OpenCV replace by the frame before, or by anything."""
+    from dpcli.prepare.decode.video_streams import how_shown
+
+    if how_shown(path, every=every)[0]:
+        raise DataError(
+            f"{path}: interlaced: each frame may show two moments, line by line, between which depth is none; if each shows one,"
+            f" say so: ffmpeg -i {path.name} -vf setfield=prog,format=gray -c:v ffv1 depth.mkv (format=gray16le of 16 bits)"
+        )
 
 
 def _colored(frame: np.ndarray) -> bool:
@@ -428,8 +447,11 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
         return DepthVideo(depth_frames(path, array, stride), **_told_beside(path, others))
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
+    from dpcli.prepare.decode.video_streams import how_shown
+
     frames, time, missing = read_timed_video(path, stride)
     if not frames:
         raise DataError(f"{path}: an empty video: no frame can be decoded")
-    left = empty_frames(path, 0)
-    return DepthVideo(np.stack(frames), time, missing, ends_early(path), {LEFT_OUT: left} if left else {})
+    told = {LEFT_OUT: empty_frames(path, 0), TURNED: int(how_shown(path)[1] > 0)}
+    notes = {what: count for what, count in told.items() if count}
+    return DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)

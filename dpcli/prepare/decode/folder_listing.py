@@ -38,6 +38,11 @@ def count_suffixes(names: Iterable[str], suffixes: tuple[str, ...]) -> Counter[s
     return Counter(os.path.splitext(name)[1] for name in lower if name.endswith(suffixes))
 
 
+def stores(folders: Iterable[str]) -> list[str]:
+    """Returns those of the names of folders that are arrays of Zarr, each a folder of its own."""
+    return [name for name in folders if name.lower().endswith(".zarr")]
+
+
 def files_below(root: Path) -> list[Path]:
     """Returns all files below ``root`` that aren't hidden, sorted; those in folders that links name too."""
     return sorted(

@@ -84,6 +84,23 @@ def video_streams(path: Path) -> list[VideoStream]:
     return found
 
 
+def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool, int]:
+    """Returns whether the first frame of a video stream is interlaced, or ``every`` one was asked for and some is, and by how many
+    quarters counterclockwise the first is turned where it is shown; (False, 0) where PyAV can't read it.
+    """
+    import av
+
+    try:
+        name = "file:" + utf8_path(path, "FFmpeg")
+        with av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace") as container:
+            frames = container.decode(video=place)
+            first = next(frames)
+            woven = bool(first.interlaced_frame) or (every and any(frame.interlaced_frame for frame in frames))
+            return woven, round(first.rotation / 90) % 4
+    except (av.FFmpegError, OSError, ValueError, IndexError, StopIteration):
+        return False, 0
+
+
 def _parsed(place: int, text: str) -> VideoStream:
     """Returns a stream from ffmpeg's words for it: ``png (MPNG / 0x474E504D), gray16be(pc, progressive), 32x24, ...``."""
     parts = [part.strip() for part in re.split(r",(?![^(]*\))", text)]

@@ -13,7 +13,8 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.decode.folder_listing import count_suffixes, walk_folders
+from dpcli.prepare.decode.cloud_files import MESHES
+from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
 from dpcli.prepare.times_beside import with_times
@@ -30,18 +31,32 @@ _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
-    " .ksplat .sog .oni .klg"
+    " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
+    " .c3d .bvh .asf .amc .skeleton"
     " .bag .mcap .db3 .active .bz2 .xz .zst .tar .tgz".split()
 )
+_MARKERS = ".trc"  # tables of markers, which are read only where that is asked for
 _NOTES = (".json", ".yaml", ".yml", ".xml", ".toml")  # that may tell poses, times or labels
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
+_TABLE = "write a table with a row for each frame and columns such as hip_x, hip_y, hip_z, and give --track columns"
+_ANIMATED = "save their frames as .obj with the same vertices, or export glTF 2.0, which `dpc prepare animation` reads"
 _ADVICE = {
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst", ".tar", ".tgz"), "unpack them"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "name the recordings themselves"),
     ".active": "end the recording, or repair it by `rosbag reindex` and call it .bag",
+    ".nc": "call them .h5 if they are netCDF 4, which is HDF5; else save their arrays as .npy",
+    ".zarr": "save their arrays as .npy",
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save their sheets as .csv"),
     **dict.fromkeys((".ksplat", ".sog"), "save them as .ply, such as with SuperSplat"),
+    _MARKERS: "give --track columns",
+    ".c3d": "export them as .trc or .csv, and give --track columns",
+    **dict.fromkeys((".bvh", ".asf", ".amc"), f"they hold angles of joints: compute where these are, and {_TABLE}"),
+    **dict.fromkeys((".skeleton", ".json"), f"if they hold joints, {_TABLE}"),
+    **dict.fromkeys((".abc", ".usd", ".usda", ".usdc", ".usdz", ".blend", ".fbx"), _ANIMATED),
+    **dict.fromkeys(
+        (".glb", ".gltf"), "where one is animated, `dpc prepare animation` reads it; else save their points as .ply"
+    ),
     **dict.fromkeys((".oni", ".klg"), "write their depth as 16-bit PNG, which `dpc prepare depth` reads"),
 }
 
@@ -54,9 +69,9 @@ def find_sequences(
     suffixes: of point clouds. pattern: of the names of frames. table: a file that is no cloud, whatever its name. Raises
     DataError when there is none, or when a folder's clip must be chosen.
     """
-    found, poses, others, alone = [], [], Counter[str](), []
+    found, poses, foreigners, alone = [], [], Counter[str](), []
     for folder, names, foreign in _folders(root, suffixes, table.resolve() if table else None):
-        others += Counter({suffix: count for suffix, count in foreign.items() if suffix not in _NOTES})
+        foreigners += foreign
         series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED) if names else None
         if series and is_pose(series.paths[0]):
             poses.append(series)
@@ -66,6 +81,10 @@ def find_sequences(
             where = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
             alone += [f"{where}{one}" for one in (*sorted(filter(is_beside, names)), *_counted(foreign))]
     if not found:
+        others = Counter({suffix: count for suffix, count in foreigners.items() if suffix not in _NOTES})
+        others = others or Counter({suffix: count for suffix, count in foreigners.items() if suffix in _ADVICE})
+        if any(others[suffix] for suffix in MESHES) and tuple(suffixes) != MESHES:
+            return find_sequences(root, MESHES, pattern=pattern, table=table)
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
@@ -108,9 +127,11 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: l
 def refuse_file(path: Path, suffixes: Sequence[str]) -> None:
     """Raises DataError where a path is one file, a cloud or of a format that is not read, and says what to do with it."""
     suffix = path.suffix.lower()
-    if suffix in _FOREIGN and path.is_file():
-        raise DataError(f"{path}: {suffix} files are not read: {_advice([suffix])}, and name their folder or table")
-    if is_cloud(path.name, suffixes) and path.is_file():
+    if suffix in (*_FOREIGN, ".json") and suffix not in (_MARKERS, *MESHES) and path.is_file():
+        advice = _advice([suffix])
+        end = "" if "--track" in advice else ", and name their folder or table"
+        raise DataError(f"{path}: {suffix} files are not read: {advice}{end}")
+    if is_cloud(path.name, (*suffixes, *MESHES)) and path.is_file():
         raise DataError(f"{path}: one cloud; expected a folder, whose files are the frames of a sequence")
 
 
@@ -127,11 +148,13 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
     """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
     are not read, by suffix; no folder that has neither.
     """
-    for folder, _, names in walk_folders(root):
+    for folder, below, names in walk_folders(root):
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        foreign = count_suffixes(names, (*_FOREIGN, *_NOTES))
+        foreign = count_suffixes(
+            [*names, *stores(below)], tuple(one for one in (*_FOREIGN, _MARKERS, *_NOTES) if one not in suffixes)
+        )
         if clouds or foreign:
             yield Path(folder), clouds, foreign
 

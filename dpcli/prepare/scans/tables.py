@@ -12,8 +12,13 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
-from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import find_further_points, find_recording_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud, without
+from dpcli.prepare.cloud_formats.column_names import (
+    ROWS_ARE_FRAMES,
+    find_frame_column,
+    find_further_points,
+    find_recording_columns,
+)
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import EMPTY, cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
@@ -25,14 +30,15 @@ from dpcli.prepare.scans.cloud_series import refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
+from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
 from dpcli.runtime.clips.other_files import stand_in
 from dpcli.store.schema import kept_names
 
-TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
+TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc", ".trc")
 MIXED = (
     "sequences whose frames mix the values of the column {0!r}; if it names the recordings, give --sequence-column {0}"
 )
-WIDE = "sequences of which one point of a row was read, {}; others were not, such as {}: write a row for each point"
+WIDE = "sequences of which one point of a row was read, {}; others were not, such as {}; " + ROWS_ARE_FRAMES
 _FEW = 5  # frames of one point that may be true
 
 
@@ -158,7 +164,8 @@ class TableSequences(OwnScans):
         sample.notes |= dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
-        if further := find_further_points([name for name in loaded.unused if name not in self.keep]):
+        further = [] if self.track == COLUMNS else find_further_points(without(loaded.unused, self.keep))
+        if further:
             sample.notes |= {WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1}
         elif len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds):
             sample.notes |= {SINGLE: 1}
@@ -175,10 +182,11 @@ class TableSequences(OwnScans):
             used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
             clock = used.columns if used else ()
             unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, self.track, *clock))
-            lines[0] += f", frames by column {loaded.column!r}"
+            lines[0] += f", frames by column {loaded.column!r}" if loaded.column else ", a frame in each row"
             if clock:
                 lines[0] += f", times by column {' and '.join(map(repr, clock))}"
-            lines[0] += f"; not read: {unused} (--keep-fields)" if unused else ""
+            lines[0] += f"; not read: {unused}" if unused else ""
+            lines[0] += " (--keep-fields)" if unused and self.track != COLUMNS else ""
         return lines + (self._table.unnamed(items) if self._table else [])
 
 
@@ -235,21 +243,27 @@ def _load(
     if not facts[0]:
         raise DataError(f"{path}: the file is empty")
     try:
-        table = ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
+        wide = read_wide(path) if track == COLUMNS else None
+        table = wide.table if wide else ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
+        rows_count = wide is not None and not (wanted or sequences or gap or find_frame_column(table.names))
+        column = "" if rows_count else frame_column(table, wanted)
+        cloud = wide.cloud(keep) if wide else cloud_of_table(table, keep)
     except DataError as error:
-        raise (stand_in(path) or error) from None
-    column = frame_column(table, wanted)
-    cloud = cloud_of_table(table, keep)
+        raise (stand_in(path) or (error if track == COLUMNS else hint(path, error))) from None
     if isinstance(table, TextTable) and (empty := table.empty_rows):
         cloud.dropped = {**cloud.dropped, EMPTY: empty}
-    cloud.track = name_rows(table, track) if track not in ("", ROWS) else None
+    cloud.track = name_rows(table, track) if track not in ("", ROWS, COLUMNS) else cloud.track
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
     named = [] if sequences else find_recording_columns(unused)
     recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
-    return Loaded(
-        cloud, split_rows(table, column, sequences, gap), column, unused, find_clocks(table, unused), recordings
-    )
+    parts = wide.rows() if wide and rows_count else split_rows(table, column, sequences, gap)
+    clocks = find_clocks(table, unused)
+    if wide:
+        parts, points = [wide.spread(part) for part in parts], len(wide.trios)
+        clocks = [replace(clock, seconds=np.repeat(clock.seconds, points)) for clock in clocks]
+        recordings = {name: np.repeat(values, points) for name, values in recordings.items()}
+    return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
 def _tables_below(folder: Path) -> Iterator[Path]:

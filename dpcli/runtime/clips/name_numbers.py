@@ -37,6 +37,10 @@ _HALF_A_DAY = 720  # minutes
 _SAID: set[str] = set()
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
+_OF_DATA_SETS = (  # names whose second number tells times, and its decimal places: ARKitScenes, Redwood's scans
+    (re.compile(r"\d{8}_\d+\.\d{3}"), 0),
+    (re.compile(r"\d{7}-\d{12}"), _MICROSECONDS),
+)
 _EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9), (18, 9))  # digits of a time since 1970, or GPS's 1980 -> decimal places
 
 
@@ -250,6 +254,9 @@ class NumberColumns:
         numbers = self.columns[column]
         if all(name.is_time[column] for name in self.names):
             return [_in_seconds(number, self.counted[column]) for number in numbers]
+        for form, places in _OF_DATA_SETS:
+            if column == 1 and all(form.fullmatch(splitext(name.text)[0]) for name in self.names):
+                return [Decimal(number).scaleb(-places) for number in numbers]
         lengths = {len(number.partition(".")[0]) for number in numbers}
         for digits, places in _EPOCHS:
             fits = lengths == {digits} and all(number[0] in "12" or digits == 18 for number in numbers)

@@ -267,8 +267,10 @@ def test_what_is_not_read_beside_the_videos_is_counted(tmp_path):
     for name in ("a/jpegs/0.jpg", "a/jpegs/1.JPG", "clip.wmv", "a/good/0.zip", ".hidden/x.zip"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "b.zarr" / "c").mkdir(parents=True)
+    (tmp_path / "b.zarr" / "c" / "0").write_bytes(b"x")
     lines = DepthVideos(inputs=(tmp_path,)).summary(DepthVideos(inputs=(tmp_path,)).items())
-    assert "not read: 1 .wmv file, a/empty (empty), a/jpegs/2 .jpg files" in lines
+    assert "not read: 1 .wmv file, 1 .zarr file, a/empty (empty), a/jpegs/2 .jpg files" in lines
 
 
 def test_folders_of_people_beside_one_another_stay_videos_whatever_their_frames_are_called(tmp_path):

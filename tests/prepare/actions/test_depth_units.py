@@ -7,7 +7,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.actions.depth_units import require_plausible, without_marks
+from dpcli.prepare.actions.depth_units import LIKE_KITTI, require_plausible, without_marks
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.scans.clouds import CloudFolders
@@ -95,6 +95,16 @@ def test_steps_of_raw_depths_tell_how_data_sets_store_millimeters(tmp_path, fram
     notes = sample_of(tmp_path / "v.npy", frames).notes
     assert [scale] == [int(note.split()[-1]) for note in notes] if scale else not notes
     assert not sample_of(tmp_path / "v.npy", frames, depth_scale=5000).notes
+
+
+def test_wide_pictures_with_few_depths_may_be_those_of_kitti(tmp_path):
+    rng = np.random.default_rng(0)
+    wide = np.where(rng.random((2, 40, 130)) < 0.2, rng.integers(1280, 20480, (2, 40, 130)), 0).astype(np.uint16)
+    assert sample_of(tmp_path / "v.npy", wide).notes == {LIKE_KITTI: 1}
+    for scale in (256, 1000):
+        assert not sample_of(tmp_path / "v.npy", wide, depth_scale=scale).notes
+    assert not sample_of(tmp_path / "v.npy", wide[:, :, :100]).notes
+    assert not sample_of(tmp_path / "v.npy", np.where(wide == 0, 5001, wide)).notes
 
 
 def test_bytes_the_wrong_way_round_are_no_depth(tmp_path):

@@ -13,8 +13,8 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.decode.depth_files import read_depth_video, rising_times
-from dpcli.prepare.decode.video_streams import video_streams
+from dpcli.prepare.decode.depth_files import TURNED, read_depth_video, rising_times
+from dpcli.prepare.decode.video_streams import how_shown, video_streams
 
 RNG = np.random.default_rng(0)
 LOSSLESS = {
@@ -172,3 +172,39 @@ def test_damaged_files_are_refused_or_give_the_frames_they_have(tmp_path):
         (tmp_path / "d.mkv").write_bytes(whole[:kept])
         with pytest.raises(DataError, match="d.mkv: not a readable video"):
             read_depth_video(tmp_path / "d.mkv")
+
+
+@pytest.mark.parametrize("name", ["a.mkv", "a.mov"])  # one read by OpenCV, one by ffmpeg
+def test_pictures_are_turned_as_they_are_shown(tmp_path, name):
+    frames = frames_of(16)
+    codec = {"a.mkv": ("gray16le", "ffv1"), "a.mov": ("gray16be", "png")}[name]
+    encode(tmp_path / f"plain_{name}", frames, *codec)
+    command = [get_ffmpeg_exe(), "-v", "error", "-display_rotation", "90", "-i", str(tmp_path / f"plain_{name}")]
+    subprocess.run([*command, "-c", "copy", str(tmp_path / name)], check=True)
+    video = read_depth_video(tmp_path / name)
+    np.testing.assert_array_equal(video.frames, np.rot90(frames, 1, axes=(1, 2)))
+    assert video.notes == {TURNED: 1}
+    assert read_depth_video(tmp_path / f"plain_{name}").notes == {}
+
+
+def test_interlaced_frames_are_refused_and_the_advice_helps(tmp_path):
+    """OpenCV 5 gives other numbers in their place, and no error."""
+    frames = frames_of(16)
+    woven = encode(tmp_path / "woven.mkv", frames, "gray16le", "ffv1", "-vf", "setfield=tff")
+    with pytest.raises(DataError, match="interlaced.*ffmpeg -i woven.mkv -vf setfield=prog"):
+        read_depth_video(woven)
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(woven), "-vf", "setfield=prog,format=gray16le"]
+    subprocess.run([*command, "-c:v", "ffv1", str(tmp_path / "depth.mkv")], check=True)
+    np.testing.assert_array_equal(read_depth_video(tmp_path / "depth.mkv").frames, frames)
+
+
+def test_frames_that_are_interlaced_behind_others_are_refused(tmp_path):
+    frames = frames_of(16, count=6)
+    for name, some, mode in (("plain", frames[:3], "prog"), ("woven", frames[3:], "tff")):
+        encode(tmp_path / f"{name}.mkv", some, "gray16le", "ffv1", "-vf", f"setfield={mode}")
+    (tmp_path / "list.txt").write_text("file plain.mkv\nfile woven.mkv\n")
+    joined = [get_ffmpeg_exe(), "-v", "error", "-f", "concat", "-i", str(tmp_path / "list.txt"), "-c", "copy"]
+    subprocess.run([*joined, str(tmp_path / "a.mkv")], check=True)
+    assert how_shown(tmp_path / "a.mkv") == (False, 0) and how_shown(tmp_path / "a.mkv", every=True) == (True, 0)
+    with pytest.raises(DataError, match="interlaced"):
+        read_depth_video(tmp_path / "a.mkv")

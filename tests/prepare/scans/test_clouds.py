@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 
 import laspy
@@ -257,8 +258,13 @@ def test_what_else_lies_there_is_named(tmp_path):
     save(tmp_path / "a" / "0.ply")
     (tmp_path / "a" / "0.obj").write_text("v 1 2 3\n")
     (tmp_path / "a" / "0.bag").write_bytes(b"#ROSBAG V2.0")
+    (tmp_path / "a" / "0.zarr").mkdir()
+    (tmp_path / "a" / "0.zarr" / "0.0").write_bytes(b"x")
     reader = CloudFolders(tmp_path)
-    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .bag file, 1 .obj file"
+    assert (
+        reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .bag file, 1 .obj file, 1 .zarr file"
+    )
+    shutil.rmtree(tmp_path / "a" / "0.zarr")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "0.bag.active").touch()
     with pytest.raises(DataError, match="found 1 .active file: end the recording, or repair it by `rosbag reindex`"):
@@ -266,7 +272,10 @@ def test_what_else_lies_there_is_named(tmp_path):
     for rest in ("a/0.bag", "b/0.bag.active"):
         (tmp_path / rest).unlink()
     (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
-    with pytest.raises(DataError, match="found 1 .gz file, 1 .obj file: unpack them, or save their points as .ply"):
+    reader = CloudFolders(tmp_path)
+    assert reader.summary(reader.items())[1] == "a: its frames are 0.obj; left out: 1 .gz file"
+    (tmp_path / "a" / "0.obj").rename(tmp_path / "a" / "0.stl")
+    with pytest.raises(DataError, match="found 1 .gz file, 1 .stl file: save their points as .ply, or unpack them"):
         CloudFolders(tmp_path).items()
     (tmp_path / "a.xlsx").write_bytes(b"PK")
     with pytest.raises(DataError, match="a.xlsx: .xlsx files are not read: save their sheets as .csv"):

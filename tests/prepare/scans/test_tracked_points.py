@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.store import CloudsReader
 from dpcli.store.views import ViewsReader
 from tests.support.commands import exit_code
@@ -203,3 +204,59 @@ def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., st
         "prepare", "synthetic", "animal", "-o", tmp_path / "bare.h5", "--size", "16", "--frames", "2", "--tracks", "0"
     )
     assert "views without true tracks" in refused("prepare", "clouds", tmp_path / "bare.h5", "-o", tmp_path / "none.h5")
+
+
+def _meshes(folder: Path, suffix: str, points: np.ndarray) -> None:
+    """Writes each frame's vertices between a face before them and normals, textures and a part behind, as exporters do."""
+    folder.mkdir()
+    for t, frame in enumerate(points.tolist()):
+        rows = [" ".join(f"{value:.6f}" for value in point) for point in frame]
+        texts = {
+            ".obj": [
+                "# v 9 9 9",
+                "mtllib a.mtl",
+                *(f"v  {row}" for row in rows[:5]),
+                "vt 0 0",
+                "vn 0 0 1",
+                "f 1/1 2/1 3/1",
+            ]
+            + ["o part", *(f"v\t{row} # here" for row in rows[5:]), "f -1 -2 -3", ""],
+            ".off": ["OFF", f"{len(rows)} 1 0", *rows, "3 0 1 2", ""],
+        }
+        (folder / f"{t:03d}{suffix}").write_text("\n".join(texts[suffix]))
+    (folder / "a.mtl").write_text("newmtl a\n")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off"])
+def test_rows_follow_the_vertices_of_meshes(tmp_path: Path, suffix: str, refused: Callable[..., str]) -> None:
+    points = _moving(np.random.default_rng(7))
+    _meshes(tmp_path / "body", suffix, points)
+    command = ("prepare", "clouds", tmp_path / "body", "--track", "rows", "-o", tmp_path / "out.h5", "--force")
+    assert 0 == exit_code(*command)
+    with CloudsReader(tmp_path / "out.h5") as clouds:
+        sequence = clouds.read(0)
+    np.testing.assert_allclose(sequence.points.reshape(points.shape), points, atol=1e-5)
+    np.testing.assert_array_equal(sequence.track, np.tile(np.arange(_POINTS), _FRAMES))
+    last = tmp_path / "body" / f"{_FRAMES - 1:03d}{suffix}"
+    whole = last.read_text()
+    row = whole.split("\n")[3]
+    last.write_text(whole.replace(row, row.rpartition(" ")[0]))
+    assert "its vertices are no rows of as many numbers each" in refused(*command)
+
+
+def test_meshes_beside_clouds_change_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    points = _moving(np.random.default_rng(8))
+    _meshes(tmp_path / "scan", ".obj", points)
+    for t in range(2):
+        np.savetxt(tmp_path / "scan" / f"{t:03d}.xyz", points[t])
+    assert 0 == exit_code("prepare", "clouds", tmp_path / "scan", "-o", tmp_path / "out.h5")
+    assert "left out: 5 .obj files" in capfd.readouterr().err
+    with CloudsReader(tmp_path / "out.h5") as clouds:
+        assert np.diff(clouds.read(0).frame_offsets).tolist() == [_POINTS] * 2
+
+
+def test_colors_of_vertices_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 1 2 3 1 0 0\nv 4 5 6 0 0.5 1\n")
+    cloud = read_cloud(tmp_path / "a.obj")
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(cloud.color, [[1, 0, 0], [0, 0.5, 1]])

@@ -51,9 +51,10 @@ class CloudUnits:
         str,
         typer.Option(
             "--track",
-            metavar="COLUMN|rows",
-            help="What tells which points of two frames are one: a column, or rows where each frame lists the same points in"
-            " the same order. Default: nothing; motions are searched.",
+            metavar="COLUMN|rows|columns",
+            help="What tells which points of two frames are one: a column; rows where each frame lists the same points in"
+            " the same order; columns where a table's row is a frame and three columns each a point. Default: nothing;"
+            " motions are searched.",
         ),
     ] = ""
 
@@ -140,13 +141,15 @@ def _make_reader(
     from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TABLES, TableSequences
     from dpcli.prepare.scans.tracked_points import TrackedViews
+    from dpcli.prepare.wide_tables import COLUMNS
     from dpcli.store.file import file_kind
 
     if made_by_dpc(raw) and file_kind(raw) == "views":
         return TrackedViews(raw, **shared)
     if topic or holds_only_recordings(raw, SUFFIXES):
         return RecordedClouds(raw, topic, **shared)
-    if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
+    of_tables = table != TableColumns() or (units.track == COLUMNS and raw.is_dir())
+    if (raw.is_file() and raw.suffix.lower() in TABLES) or of_tables:
         return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
     if units.axes or holds_sequences(raw, SUFFIXES):
         return ArraySequences(raw, units.axes, pattern=pattern, **shared)
