@@ -68,6 +68,15 @@ def text_font(size: int) -> Any:
     return ImageFont.load_default(size=size)
 
 
+def shortened(text: str, most: int) -> str:
+    """Returns a text of at most `most` characters, the last of them "…" where some are left out.
+
+    >>> shortened("high arm wave", 8), shortened("bend", 8)
+    ('high ar…', 'bend')
+    """
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB) -> None:
     """Writes a text in one line on a PIL drawing, shortened to the width (pixels) there is; names may hold ends of lines."""
     font, text = text_font(13), printable(text)
