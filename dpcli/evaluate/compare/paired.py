@@ -46,8 +46,12 @@ class Change:
 
     @property
     def difference(self) -> float:
-        """Returns the value of A less that of B, in `unit`."""
-        return self.a - self.b
+        """Returns the value of A less that of B, in `unit`; 0 where they differ by rounding, as sums in another order do."""
+        return _difference(self.a, self.b)
+
+
+def _difference(a: float, b: float) -> float:
+    return 0.0 if abs(a - b) <= _EQUAL * max(1.0, abs(a)) else a - b
 
 
 @dataclass(frozen=True)
@@ -209,8 +213,9 @@ def _change(
     one, other = exact
     ends, p = Interval(np.nan, np.nan), float("nan")
     if found is not None:
-        ends = interval(one - other, found, resampling.confidence)
-        p = two_sided_p(snapped(found, one - other)) if ends.defined else p
+        apart = _difference(one, other)
+        ends = interval(apart, found, resampling.confidence)
+        p = two_sided_p(snapped(found, apart)) if ends.defined else p
     counts = _compare_samples(key, a, b) if key in a.per_sample else ()
     return Change(a.units[key], one, other, ends, p, *counts)
 

@@ -21,7 +21,7 @@ from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
 from dpcli.evaluate.compare.result_json import compare_json
 from dpcli.evaluate.compare.significance_tests import mcnemar
 from dpcli.evaluate.results import LeftOut
-from dpcli.store import ScoresWriter
+from dpcli.store import PartsReader, PartsWriter, ScoresWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scores_helpers import CLASSES, write_scores
 
@@ -242,3 +242,19 @@ def test_what_cannot_be_compared(run, scores, parts, tmp_path):
         run("compare", parts["truth"], parts["truth"])
     with pytest.raises(UsageError, match="--protocol and --ignore-below are for parts"):
         run("compare", scores["good"], scores["good"], "--ignore-below", 3)
+
+
+def test_rounding_is_no_difference(run, parts, tmp_path):
+    """The same sequences in another order: the sums of a mean differ in their last bit."""
+    turned = tmp_path / "turned.h5"
+    with (
+        PartsReader(parts["twin"]) as reader,
+        PartsWriter(turned, num_parts=4, length_unit=reader.length_unit) as writer,
+    ):
+        for row in (5, 2, 7, 0, 3, 6, 1, 4):
+            said = reader.read_parts(row)
+            sequence = reader.read(row, fields=("part",))
+            writer.write(sequence, said.probability, said.pairs, said.motion, said.flow)
+    words = run("compare", parts["twin"], turned, "--truth", parts["truth"], "--json", "--resamples", 200)
+    for own in json.loads(words)["metrics"].values():
+        assert (own["difference"], own["interval"], own["p"]) == (0, [0, 0], 1)
