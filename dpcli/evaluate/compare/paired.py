@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, interval, replicates, snapped, two_sided_p
+from dpcli.evaluate.bootstrap import FEW, TOO_FEW, Interval, Resampling, interval, replicates, snapped, two_sided_p
 from dpcli.evaluate.choices import LOWER_IS_BETTER
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics
 from dpcli.evaluate.compare.measure_file import kind_of_file, measure_file
@@ -111,7 +111,19 @@ def evaluate_compare(
         for task in own
         if task not in other
     ]
+    notes += _few_samples(parts[0], resampling)
     return CompareReport(sources, options, resampling, parts, (sides[0][0].provenance, sides[1][0].provenance), notes)
+
+
+def _few_samples(part: Paired, resampling: Resampling) -> list[str]:
+    """Returns a sentence where so few samples were resampled that the bootstrap makes p too small, else none."""
+    count = len(part.names)
+    if not resampling.resamples or not 2 <= count < FEW:
+        return []
+    return [
+        f"{count} {part.kind} are few for a bootstrap: its intervals are too narrow and its p too small. {TOO_FEW} "
+        f"Wilcoxon's p can't be below {2 / 2**count:.2g} here."
+    ]
 
 
 def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, intersect: bool = False) -> Paired:
