@@ -69,11 +69,12 @@ def text_font(size: int) -> Any:
 
 
 def shortened(text: str, most: int) -> str:
-    """Returns a text of at most `most` characters, the last of them "…" where some are left out.
+    """Returns a text on one line, of at most `most` characters, the last of them "…" where some are left out.
 
     >>> shortened("high arm wave", 8), shortened("bend", 8)
     ('high ar…', 'bend')
     """
+    text = printable(text)
     return text if len(text) <= most else text[: most - 1] + "…"
 
 

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from dpcli.classify.explain import pictures
 from dpcli.draw import bars, confusion_matrix, learning_curves
 from dpcli.draw.bars import Bars, Histogram, draw_panels
 from dpcli.draw.confusion_matrix import draw_confusion
@@ -34,7 +35,7 @@ def saved(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
         figures.append(figure)
         save_figure(figure, path, dpi)
 
-    for module in (bars, confusion_matrix, learning_curves, paired_picture):
+    for module in (bars, confusion_matrix, learning_curves, paired_picture, pictures):
         monkeypatch.setattr(module, "save_figure", keep)
     return figures
 
@@ -146,3 +147,13 @@ def test_a_comparison_of_files_in_deep_folders_shows_their_names(saved: list[Fig
         -1
     ]  # McNemar's test is of the best class; these are the samples of the metric that was asked for
     assert [text.get_text() for text in counts.texts] == ["1", "1", "2", "0"] and "top-5" in counts.get_title()
+
+
+def test_every_class_of_a_plane_is_in_its_legend_under_its_own_name(saved: list[Figure], tmp_path: Path) -> None:
+    names = ["_idle", r"$\frac{a$", "a_b $x^2$", "two\nlines", "", "n" * 90]
+    labels = np.arange(-1, 7)  # unknown, six with a name or none, one beyond the names
+    places = {stream: np.random.default_rng(0).normal(size=(8, 2)) for stream in ("static", "dynamic")}
+    pictures.plane_picture(tmp_path / "p.png", places, labels, names, dict.fromkeys(places, "silhouette 0.31"))
+    told = [text.get_text() for text in saved[0].legends[0].get_texts()]
+    assert told[:4] == ["no label", *names[:3]] and len(told) == 8 and "\n" not in told[4]
+    assert told[5] == "4" and told[6].endswith("…") and told[7] == "6" and _texts_cut_off(saved[0]) == []
