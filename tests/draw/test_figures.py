@@ -157,3 +157,10 @@ def test_every_class_of_a_plane_is_in_its_legend_under_its_own_name(saved: list[
     told = [text.get_text() for text in saved[0].legends[0].get_texts()]
     assert told[:4] == ["no label", *names[:3]] and len(told) == 8 and "\n" not in told[4]
     assert told[5] == "4" and told[6].endswith("…") and told[7] == "6" and _texts_cut_off(saved[0]) == []
+
+
+def test_letters_that_the_font_lacks_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for names, words in ((["\u624b\u3092\u632f\u308b", "\u624b"], "lacks 4 letters"), (["Grün", "волна"], "")):
+        draw_confusion(np.eye(2, dtype=int), names, "accuracy 100 %", tmp_path / "c.png")
+        told = capsys.readouterr().err
+        assert words in told and bool(words) == bool(told)
