@@ -185,11 +185,12 @@ def _common_samples(a: FileMetrics, b: FileMetrics, intersect: bool) -> tuple[Fi
     common = [name for name in a.names if name not in set(only_a)]
     if not common:
         raise DataError(f"{a.source} and {b.source} have not one of their {a.kind} in common")
-    left_out = [
-        *_without_repeats([*a.left_out, *b.left_out]),
-        LeftOut(f"only in {a.source}", only_a),
-        LeftOut(f"only in {b.source}", only_b),
+    one_sided = {*only_a, *only_b}  # the side that lacks them leaves them out, too
+    told = [
+        LeftOut(entry.reason, [name for name in entry.names if name not in one_sided])
+        for entry in (*a.left_out, *b.left_out)
     ]
+    left_out = [*_without_repeats(told), LeftOut(f"only in {a.source}", only_a), LeftOut(f"only in {b.source}", only_b)]
     a, b = a.restricted(common), b.restricted(common)
     for what in a.must_equal_by_sample:
         _check_facts_of_samples(a, b, what)
