@@ -41,6 +41,11 @@ def write_info_page(
     from dpcli.runtime.whole_file import check_target
 
     check_target(page, "--page", PAGES)
+    if kind == "statistics":
+        raise UsageError(
+            f"--page: {path.name} holds statistics, which have no page; `dpc evaluate segmentation` or `motion` prints what"
+            " follows from them, and `dpc evaluate report` makes a page of that"
+        )
     if kind not in ("clouds", "parts") and (chosen or view):
         option = "--sequence" if chosen else "--view"
         raise UsageError(f"{option} is of point clouds, this file holds {kind!r}; leave it out")

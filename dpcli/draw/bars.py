@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _INCH_PER_ROW = 0.75
+_WIDTH, _SHORT_TITLE, _INCH_PER_LETTER = 5.2, 12, 0.065  # of a panel whose titles have so many letters; at 8 points
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Bars:
         axes.invert_yaxis()
         axes.grid(axis="x", color="#e4e8ee", linewidth=0.6)
         axes.set_axisbelow(True)
-        axes.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(self.values), frameon=False)
+        axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(self.values), frameon=False)
         axes.set_xlabel(self.unit)
         if self.most is not None:
             axes.set_xlim(0, self.most if self.cut else max(self.most, axes.get_xlim()[1]))
@@ -67,7 +68,9 @@ def draw_panels(panels: Sequence[Bars | Histogram], rows: int, headline: str, pa
     """Writes panels side by side, as high as so many groups of bars need. Raises DataError when it can't be written."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.2 * len(panels), 1.6 + _INCH_PER_ROW * max(rows, 3)), layout="constrained")
+    longest = max((len(title) for panel in panels if isinstance(panel, Bars) for title in panel.titles), default=0)
+    width = _WIDTH + _INCH_PER_LETTER * max(0, longest - _SHORT_TITLE)
+    figure = Figure(figsize=(width * len(panels), 1.6 + _INCH_PER_ROW * max(rows, 3)), layout="constrained")
     for number, panel in enumerate(panels):
         panel.draw(figure.add_subplot(1, len(panels), number + 1))
     figure.suptitle(headline, fontsize=10, parse_math=False)

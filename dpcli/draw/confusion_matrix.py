@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dpcli.draw.reliability import WIDTH, Reliability, draw_reliability
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import save_figure, shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,6 +37,8 @@ def draw_confusion(
     wide, high = side + margin + 1.0, side + margin + 0.7
     more = WIDTH if reliability is not None else 0.0
     figure = Figure(figsize=(wide + more, high), layout="constrained")
+    if more:  # beside another subfigure the names of the axes come out nearer to the edge than the space around them
+        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.06)
     places = figure.subfigures(1, 2, width_ratios=(wide, more)) if more else [figure]
     axes = places[0].add_subplot()
     shares = confusion / np.maximum(confusion.sum(axis=1, keepdims=True), 1)
@@ -53,8 +55,7 @@ def draw_confusion(
 
 
 def _axis_title(label: int, name: str) -> str:
-    short = name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 1] + "…"
-    return f"{short} {label}".strip()
+    return f"{shortened(name, _LONGEST_NAME)} {label}".strip()
 
 
 def _number_cells(axes: Axes, confusion: np.ndarray, shares: np.ndarray, size: float) -> None:

@@ -37,6 +37,7 @@ def draw_reliability(found: Reliability, figure: Figure | SubFigure) -> None:
     upper.set_title(found.title, fontsize=8)
     lower.bar(left, found.samples, width, align="edge", color="#9aa7b8", edgecolor="white", linewidth=0.5)
     lower.set(xlabel="probability of the best class", ylabel="samples")
+    lower.locator_params(axis="y", integer=True, nbins=5, min_n_ticks=1)
     for axes in (upper, lower):
         axes.tick_params(labelsize=7)
         axes.xaxis.label.set_size(8)

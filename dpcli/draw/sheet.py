@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.draw.palette import DARK, RGB, Theme
 from dpcli.errors import DataError
+from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import whole_file
 from dpcli.standard_streams import printable
 
@@ -18,6 +22,7 @@ if TYPE_CHECKING:
 
 GAP = 4  # pixels between cells
 TITLE_HEIGHT = 18  # pixels of a title's line
+_NO_LETTER = re.compile(r"Glyph (\d+) .*missing from")  # as matplotlib warns
 
 
 class SheetRow(NamedTuple):
@@ -68,6 +73,16 @@ def text_font(size: int) -> Any:
     return ImageFont.load_default(size=size)
 
 
+def shortened(text: str, most: int) -> str:
+    """Returns a text on one line, of at most `most` characters, the last of them "…" where some are left out.
+
+    >>> shortened("high arm wave", 8), shortened("bend", 8)
+    ('high ar…', 'bend')
+    """
+    text = printable(text)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB) -> None:
     """Writes a text in one line on a PIL drawing, shortened to the width (pixels) there is; names may hold ends of lines."""
     font, text = text_font(13), printable(text)
@@ -88,9 +103,17 @@ def save_picture(image: Any, path: Path) -> None:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Writes a matplotlib figure, whole or not at all. Raises DataError when it can't be written."""
+    """Writes a matplotlib figure, whole or not at all, and warns of letters that its font lacks. Raises DataError when it can't be
+    written."""
     try:
-        with whole_file(path) as part:
+        with whole_file(path) as part, warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
             figure.savefig(part, dpi=dpi)
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
+    lacking = {found[1] for one in told if (found := _NO_LETTER.search(str(one.message)))}
+    if lacking:
+        log.warn(
+            f"{path}: the font of pictures lacks {counted(len(lacking), 'letter')} of the names, which are boxes there;"
+            " names in Latin, Greek or Cyrillic letters are shown"
+        )

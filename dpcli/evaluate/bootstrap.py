@@ -20,6 +20,8 @@ WeightedMetric = Callable[[np.ndarray], dict[str, np.ndarray]]
 """Counts f64 (R,n), how often each of n samples counts in each of R resamples -> value f64 (R) by metric, NaN = 0/0."""
 
 METHODS = ("bca", "percentile")
+FEW = 10  # samples below which a bootstrap underestimates how far they may be from others
+TOO_FEW = "Of 95 % intervals of a mean of 4 normal values, 80 % hold the true one; of 10, 89 %."
 _BLOCK = 1 << 21  # counts in memory at once
 _MOST_LEFT_OUT = 2000  # samples up to which each is left out once, for BCa's acceleration
 _EQUAL = 1e-12  # relative: sums in another order

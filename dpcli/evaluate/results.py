@@ -18,6 +18,10 @@ from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
 
 _NAMES_IN_NOTE = 10
+KEPT_STATISTICS = (
+    "statistics that an evaluation kept; `dpc evaluate segmentation FILE --json` (or motion) makes the result of them that"
+    " `runs` and `report` take, `compare` needs the parts files"
+)
 Statistics, Measured = TypeVar("Statistics"), TypeVar("Measured")
 
 

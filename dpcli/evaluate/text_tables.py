@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import FEW, TOO_FEW, Interval, Resampling
 from dpcli.evaluate.markdown import as_markdown, markdown_table
 from dpcli.standard_streams import printable
 
@@ -66,7 +66,7 @@ def four_digit_ends(own: Interval | None) -> str:
 
 
 def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
-    """Returns how the intervals were found, as a list of one sentence, or of none where there are no intervals.
+    """Returns how the intervals were found, and that they are too narrow where they are of few, or nothing without intervals.
 
     of: what was resampled, in words. number: how many of them there are.
     """
@@ -76,7 +76,8 @@ def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
         return [f"Intervals: undefined; there is one of these {of} only, and nothing says how another would differ."]
     return [
         f"Intervals: {100 * resampling.confidence:.4g} %, bootstrap (BCa, {resampling.resamples} resamples of the "
-        f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training."
+        f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training.",
+        *([f"They are too narrow: {number} {of} are few for a bootstrap. {TOO_FEW}"] if number < FEW else []),
     ]
 
 

@@ -13,7 +13,12 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.draw.page.points import PageFacts
+from dpcli.draw.page.scatter import scatter_page
+from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+from dpcli.evaluate.segmentation.sequence_pass import Keeping
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 ROOT = Path(__file__).parents[2]
 
@@ -224,3 +229,19 @@ def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
     assert cut.returncode == 3 and b"not a complete safetensors file" in cut.stderr
     for other in (tmp_path, "msraction3d", "no/msraction3d-24", "*"):
         assert dpc_here("info", other).returncode == 3
+
+
+def test_statistics_have_no_page_and_say_what_has(dpc_here, tmp_path: Path) -> None:
+    truth = truth_sequence("s0", seed=0)
+    paths = write_parts(tmp_path / "parts.h5", [perfect(truth, 4)]), write_truth(tmp_path / "truth.h5", [truth])
+    evaluate_segmentation(*paths, keeping=Keeping(tmp_path / "kept.h5"))
+    refused = dpc_here("info", tmp_path / "kept.h5", "--page", tmp_path / "k.html")
+    assert refused.returncode == 2 and b"dpc evaluate report" in refused.stderr
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
+def test_dots_of_an_embedding_stay_apart_whatever_their_scale(scale: float) -> None:
+    places = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32) * np.float32(scale)
+    page = scatter_page(PageFacts("e", ""), [""] * 40, [], np.zeros(40, int), {"static": (places, {})})
+    shown = json.loads(re.search(r'id="header">(.*?)</script>', page, re.S)[1])["planes"][0]["places"]
+    assert np.abs(np.array(shown) - places).max() <= 1e-4 * np.ptp(places)

@@ -12,7 +12,7 @@ from dpcli.classify.explain.point_activation_cloud import ActivationCloud
 from dpcli.draw.animation import write_pictures
 from dpcli.draw.palette import DARK, heat_colors
 from dpcli.draw.points import Raster, draw_dots
-from dpcli.draw.sheet import save_figure, save_picture, spread_evenly, text_font, write_line
+from dpcli.draw.sheet import save_figure, save_picture, shortened, spread_evenly, text_font, write_line
 
 ANIMATIONS = (".gif", ".mp4")
 _CELL, _GAP, _TITLE, _MARGIN = 132, 3, 20, 58  # pixels: of a cell, between cells, of a title's line, left of the rows
@@ -123,27 +123,25 @@ def plane_picture(
     columns = -(-max(len(present), 1) // 22)
     figure = Figure(figsize=(4.6 * len(coordinates) + 1.7 * columns, 4.9), layout="constrained")
     panels = figure.subplots(1, len(coordinates), squeeze=False)[0]
+    names = [_short(label, class_names) for label in present]
     for axes, (stream, xy) in zip(panels, coordinates.items()):
         unknown = labels < 0
+        handles = []
         if unknown.any():
-            axes.scatter(*xy[unknown].T, s=16, color="0.65", label="no label", linewidths=0)
+            handles.append(axes.scatter(*xy[unknown].T, s=16, color="0.65", linewidths=0))
         for place, label in enumerate(present):
             color, marker = _style(place, len(present))
-            axes.scatter(
-                *xy[labels == label].T,
-                s=22,
-                color=[color],
-                marker=marker,
-                linewidths=0,
-                label=_short(label, class_names),
-            )
+            handles.append(axes.scatter(*xy[labels == label].T, s=22, color=[color], marker=marker, linewidths=0))
         axes.set_title(f"{stream}\n{captions[stream]}", fontsize=10)
         axes.set(xticks=[], yticks=[])
         axes.margins(0.06)
         for spine in axes.spines.values():
             spine.set_color("0.8")
-    handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside right upper", ncols=columns, fontsize=7.5, frameon=False)
+    places = map(str, range(len(handles)))  # a legend leaves out what is called nothing or begins with _
+    legend = figure.legend(handles, places, loc="outside right upper", ncols=columns, fontsize=7.5, frameon=False)
+    for text, name in zip(legend.get_texts(), [*(["no label"] if (labels < 0).any() else []), *names], strict=True):
+        text.set_parse_math(False)
+        text.set_text(name)
     save_figure(figure, path, 130)
 
 
@@ -155,5 +153,4 @@ def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:
 
 
 def _short(label: int, class_names: Sequence[str]) -> str:
-    name = class_names[label] if label < len(class_names) else str(label)
-    return (name if len(name) <= 26 else name[:25] + "…").replace("$", r"\$")
+    return shortened((class_names[label] if label < len(class_names) else "") or str(label), 26)

@@ -43,8 +43,15 @@ def scatter_page(
         "labels": labels[kept].tolist(),
         "classes": classes,
         "planes": [
-            {"title": title, "places": np.round(places[kept].astype(np.float64), 4).tolist(), "figures": dict(figures)}
+            {"title": title, "places": _rounded(places[kept]), "figures": dict(figures)}
             for title, (places, figures) in planes.items()
         ],
     }
     return data_page(header, "scatter", script=("scatter",))
+
+
+def _rounded(places: np.ndarray) -> list[list[float]]:
+    """Returns places (S,2) to four decimals, or more where they lie so near one another that these would merge them."""
+    span = float(np.ptp(places.astype(np.float64), axis=0).max(initial=0))
+    digits = 4 if span == 0 else max(4, 4 - int(np.floor(np.log10(span))))
+    return np.round(places.astype(np.float64), digits).tolist()

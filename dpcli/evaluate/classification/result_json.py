@@ -36,7 +36,7 @@ def classification_json(report: ClassificationReport, source: str, provenance: S
         "units": {
             **{key: "fraction" for key in (*shares, "recall", "precision", "f1")},
             "confusion": "samples",
-            "reliability": "fraction",
+            **dict.fromkeys(("confidence", "calibration_error_by_chance"), "fraction"),
         },
         "denominators": {
             "samples": main.samples,

@@ -14,6 +14,7 @@ from dpcli.evaluate.choices import CLASSIFICATION_METRICS, MOTION_METRICS, SEGME
 from dpcli.evaluate.classification.metrics import classification_weighted, predicted_labels, top_hits
 from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed, metrics_of_values
+from dpcli.evaluate.results import KEPT_STATISTICS
 from dpcli.evaluate.segmentation.metrics import segmentation_weighted
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, motion_weighted
 from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
@@ -34,6 +35,8 @@ _ROWS = 256
 def kind_of_file(path: Path, source: str) -> str:
     """Returns scores, parts or video. source: the path as named, for the message. Raises DataError for another kind of file."""
     kind = "views" if is_media(path) else file_kind(path)
+    if kind == "statistics":
+        raise DataError(f"{source}: {KEPT_STATISTICS}")
     if kind not in ("scores", "parts", *_VIDEO_FILES):
         raise DataError(
             f"{source}: a {kind} file; expected scores or parts (`dpc classify predict`, `dpc segment "

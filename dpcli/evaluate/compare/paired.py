@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, interval, replicates, snapped, two_sided_p
+from dpcli.evaluate.bootstrap import FEW, TOO_FEW, Interval, Resampling, interval, replicates, snapped, two_sided_p
 from dpcli.evaluate.choices import LOWER_IS_BETTER
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics
 from dpcli.evaluate.compare.measure_file import kind_of_file, measure_file
@@ -46,8 +46,12 @@ class Change:
 
     @property
     def difference(self) -> float:
-        """Returns the value of A less that of B, in `unit`."""
-        return self.a - self.b
+        """Returns the value of A less that of B, in `unit`; 0 where they differ by rounding, as sums in another order do."""
+        return _difference(self.a, self.b)
+
+
+def _difference(a: float, b: float) -> float:
+    return 0.0 if abs(a - b) <= _EQUAL * max(1.0, abs(a)) else a - b
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,19 @@ def evaluate_compare(
         for task in own
         if task not in other
     ]
+    notes += _few_samples(parts[0], resampling)
     return CompareReport(sources, options, resampling, parts, (sides[0][0].provenance, sides[1][0].provenance), notes)
+
+
+def _few_samples(part: Paired, resampling: Resampling) -> list[str]:
+    """Returns a sentence where so few samples were resampled that the bootstrap makes p too small, else none."""
+    count = len(part.names)
+    if not resampling.resamples or not 2 <= count < FEW:
+        return []
+    return [
+        f"{count} {part.kind} are few for a bootstrap: its intervals are too narrow and its p too small. {TOO_FEW} "
+        f"Wilcoxon's p can't be below {2 / 2**count:.2g} here."
+    ]
 
 
 def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, intersect: bool = False) -> Paired:
@@ -169,11 +185,12 @@ def _common_samples(a: FileMetrics, b: FileMetrics, intersect: bool) -> tuple[Fi
     common = [name for name in a.names if name not in set(only_a)]
     if not common:
         raise DataError(f"{a.source} and {b.source} have not one of their {a.kind} in common")
-    left_out = [
-        *_without_repeats([*a.left_out, *b.left_out]),
-        LeftOut(f"only in {a.source}", only_a),
-        LeftOut(f"only in {b.source}", only_b),
+    one_sided = {*only_a, *only_b}  # the side that lacks them leaves them out, too
+    told = [
+        LeftOut(entry.reason, [name for name in entry.names if name not in one_sided])
+        for entry in (*a.left_out, *b.left_out)
     ]
+    left_out = [*_without_repeats(told), LeftOut(f"only in {a.source}", only_a), LeftOut(f"only in {b.source}", only_b)]
     a, b = a.restricted(common), b.restricted(common)
     for what in a.must_equal_by_sample:
         _check_facts_of_samples(a, b, what)
@@ -209,8 +226,9 @@ def _change(
     one, other = exact
     ends, p = Interval(np.nan, np.nan), float("nan")
     if found is not None:
-        ends = interval(one - other, found, resampling.confidence)
-        p = two_sided_p(snapped(found, one - other)) if ends.defined else p
+        apart = _difference(one, other)
+        ends = interval(apart, found, resampling.confidence)
+        p = two_sided_p(snapped(found, apart)) if ends.defined else p
     counts = _compare_samples(key, a, b) if key in a.per_sample else ()
     return Change(a.units[key], one, other, ends, p, *counts)
 

@@ -9,6 +9,9 @@ import numpy as np
 from dpcli.draw.sheet import save_figure
 from dpcli.evaluate.compare.number_text import metric_title
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
+from dpcli.evaluate.metric_titles import title_of
+
+_LETTERS_PER_INCH = 12  # of text at 9 points
 
 
 def draw_comparison(report: CompareReport, path: Path) -> None:
@@ -26,8 +29,15 @@ def draw_comparison(report: CompareReport, path: Path) -> None:
     for place, group in zip(axes, panels, strict=False):
         _differences_panel(place, group)
     _samples_panel(axes[-1], part)
-    figure.suptitle(f"A: {report.sources[0]}\nB: {report.sources[1]}", fontsize=9, parse_math=False)
+    room = int(_LETTERS_PER_INCH * figure.get_figwidth())
+    lines = [f"{side}: {_end_of(source, room)}" for side, source in zip("AB", report.sources, strict=True)]
+    figure.suptitle("\n".join(lines), fontsize=9, parse_math=False)
     save_figure(figure, path)
+
+
+def _end_of(path: str, room: int) -> str:
+    """Returns a path, or its end where it has more letters than there is room for: the file's name tells most."""
+    return path if len(path) <= room else "…" + path[1 - room :]
 
 
 def _differences_panel(axes, group: dict[str, Change]) -> None:
@@ -57,6 +67,7 @@ def _samples_panel(axes, part: Paired) -> None:
                 axes.text(j, i, str(count), ha="center", va="center")
         axes.set_xticks([0, 1], ["B right", "B wrong"])
         axes.set_yticks([0, 1], ["A right", "A wrong"])
+        axes.set_title(f"{part.kind}, right by {title_of(part.changed_by)}", fontsize=9, parse_math=False)
         return
     axes.plot(scale * b, scale * a, ".", color="#4c72b0")
     defined = scale * np.concatenate([a, b])

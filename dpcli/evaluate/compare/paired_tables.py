@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dpcli.counted import counted
 from dpcli.evaluate.choices import LOWER_IS_BETTER
 from dpcli.evaluate.compare.number_text import metric_title, number_text, p_value_text, signed_ends
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
@@ -18,7 +19,8 @@ def compare_tables(report: CompareReport) -> list[TextTable]:
         interval = f"{100 * report.resampling.confidence:.4g} % interval"
         header = ["metric", "A", "B", "A - B", interval, "p", "A better", "B better", "equal", "Wilcoxon p"]
         rows = [_change_row(key, change) for key, change in part.changes.items()]
-        made.append(TextTable(f"{part.task.capitalize()}: A against B, {len(part.names)} {part.kind}", header, rows))
+        of = counted(len(part.names), part.kind.removesuffix("s"))
+        made.append(TextTable(f"{part.task.capitalize()}: A against B, {of}", header, rows))
         if part.changed:
             made.append(_changed(part))
     return made

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dpcli.counted import counted
 from dpcli.evaluate.compare.number_text import metric_title, number_text, plain_ends
 from dpcli.evaluate.compare.runs import RunsReport
 from dpcli.evaluate.text_tables import TextTable
@@ -18,19 +19,21 @@ def runs_tables(report: RunsReport) -> list[TextTable]:
         ["± sd", *(number_text(spreads[key].sd, units[key]) for key in keys)],
         [f"{100 * report.confidence:.4g} % interval", *(plain_ends(spreads[key].interval, units[key]) for key in keys)],
     ]
-    return [TextTable(f"{report.task.capitalize()} of {len(report.runs)} runs", header, rows)]
+    return [TextTable(f"{report.task.capitalize()} of {counted(len(report.runs), 'run')}", header, rows)]
 
 
 def runs_notes(report: RunsReport) -> list[str]:
     """Returns sentences on what a run is, and what the spread says."""
     lines = [f"{run.title}: {run.source}" for run in report.runs]
-    number_of = f"{report.number} {report.kind}" if report.number else "the same samples"
-    lines.append(
-        f"All on {number_of}. sd over runs (n - 1 in the denominator); interval of the mean: Student's t, "
-        f"{len(report.runs) - 1} degrees of freedom. It says what other runs would give on these samples."
-    )
+    number_of = counted(report.number, report.kind.removesuffix("s")) if report.number else "the same samples"
     if len(report.runs) == 1:
-        lines.append("One run only: its spread is undefined.")
+        lines.append(f"On {number_of}. One run only: its spread is undefined.")
+    else:
+        degrees = counted(len(report.runs) - 1, "degree")
+        lines.append(
+            f"All on {number_of}. sd over runs (n - 1 in the denominator); interval of the mean: Student's t, "
+            f"{degrees} of freedom. It says what other runs would give on these samples."
+        )
     lines += [
         f"{metric_title(key, '')}: undefined in some runs, so without a mean."
         for key in report.units

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
 from dpcli import __version__
 from dpcli.errors import DataError
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table, table
 from dpcli.evaluate.report.classification_section import SHOWN_HERE, classification_blocks
 from dpcli.evaluate.report.collect import Collected, CollectedResult
@@ -74,6 +75,9 @@ def _section(number: int, result: CollectedResult, title: str) -> Section:
         f"Left out, {own.get('reason', 'unknown')}: {own.get('count', len(own.get('names', [])))}."
         for own in found.get("left_out", [])
     ]
+    missing = found.get("not_computed", {})
+    reasons = missing.items() if isinstance(missing, Mapping) else ()
+    left_out += [f"{title_of(name)} not computed: {reason}." for name, reason in reasons]
     commands = [str(own["command"]) for own in found.get("provenance", []) if own.get("command")]
     return Section(
         f"result-{number}",

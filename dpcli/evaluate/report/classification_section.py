@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.metric_titles import title_of
-from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table
+from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, is_number, table
 from dpcli.evaluate.report.charts import confusion_grid
 
 SHOWN_HERE = ("streams", "per_class", "confusion")
@@ -26,7 +26,7 @@ def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
     classes = [row for row in metrics.get("per_class", []) if isinstance(row, Mapping)]
     blocks: list[Table | Figure] = []
     if isinstance(metrics.get("streams"), Mapping):
-        blocks.append(_stream_table(metrics["streams"], found.get("denominators", {})))
+        blocks.append(_stream_table(found))
     if classes:
         blocks.append(_class_table(classes))
     confusion = _confusion_matrix(metrics.get("confusion"), len(classes))
@@ -36,7 +36,10 @@ def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
     return blocks
 
 
-def _stream_table(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
+def _stream_table(found: Mapping[str, Any]) -> Table:
+    streams, counts = found["metrics"]["streams"], found.get("denominators", {})
+    level = found.get("intervals", {}).get("confidence")  # absent where nothing was resampled; the protocol then has it
+    heading = f"{100 * level:.4g} % interval of accuracy" if is_number(level) else "interval of accuracy"
     names = list(dict.fromkeys(key for own in streams.values() for key in own if not key.endswith("_interval")))
     samples, correct = counts.get("samples"), counts.get("correct", {})
     rows = []
@@ -46,9 +49,7 @@ def _stream_table(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Tabl
         rows.append(
             [stream, hits, interval, *(cell(own.get(name), "fraction", bar=name == "accuracy") for name in names)]
         )
-    return table(
-        "By stream", ("stream", "correct", "95 % interval of accuracy", *map(title_of, names)), rows, key="streams"
-    )
+    return table("By stream", ("stream", "correct", heading, *map(title_of, names)), rows, key="streams")
 
 
 def _class_table(classes: list[Mapping[str, Any]]) -> Table:

@@ -12,6 +12,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report.blocks import Figure, Table
 from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
+from dpcli.evaluate.results import KEPT_STATISTICS
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.file import MAGIC, is_hdf5
 from dpcli.store.pipes import standard_input
@@ -82,6 +83,8 @@ def _results_of(
         return [_video_result(path, own, pictures)]
     if kind == "video" and not path.exists():
         raise DataError(f"{path}: no such file; {_EXPECTED}")
+    if kind == "statistics":
+        raise DataError(f"{path}: {KEPT_STATISTICS}")
     raise DataError(f"{path}: holds {kind!r}, which has no result in it; {_EXPECTED}")
 
 
@@ -179,7 +182,7 @@ def _scores_result(path: Path, truth: Path | None, split: str | None) -> Collect
 
 
 def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[CollectedResult]:
-    """Returns segmentation, and motion where the truth has poses and the prediction frame pairs."""
+    """Returns segmentation, and motion where the truth has poses or scene flow and the prediction frame pairs that it tells of."""
     from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
     from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
@@ -188,7 +191,8 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
     with CloudsReader(truth) as clouds, PartsReader(path) as predicted:
-        motion, provenance = "pose" in clouds.fields and bool((predicted.pair_counts > 0).any()), predicted.provenance
+        moves, provenance = bool((predicted.pair_counts > 0).any()), predicted.provenance
+        posed, flows = (field in clouds.fields and moves for field in ("pose", "scene_flow"))
     options = {"split": split, "resampling": Resampling()}
     made = [
         CollectedResult(
@@ -196,14 +200,16 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
             str(path),
         )
     ]
-    if motion:
-        made.append(
-            CollectedResult(
-                _through_json(motion_json(evaluate_motion(path, truth, **options), str(path), provenance)), str(path)
-            )
-        )
+    if posed or flows:
+        try:
+            report = evaluate_motion(path, truth, **options)
+            made.append(CollectedResult(_through_json(motion_json(report, str(path), provenance)), str(path)))
+        except DataError as error:
+            if posed:
+                raise
+            made[0].notes.append(f"No motion: {error}.")
     if pictures:
-        made[0].extras = part_blocks(path, truth, split=split, motion=motion)
+        made[0].extras = part_blocks(path, truth, split=split, motion=posed)
     return made
 
 

@@ -72,8 +72,8 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
     blocks: list[Table | Figure] = []
     notes: list[str] = []
     for key, value in metrics.items():
-        if key in skip or key in grouped or key.endswith("_interval"):
-            continue
+        if key in skip or key in grouped or key.endswith("_interval") or (value is None and key not in units):
+            continue  # what is missing and has no unit is no number: records that the object lacks
         if _is_scalar(value) or interval_of(value):
             scalars.append((key, value, key))
         elif (
@@ -85,7 +85,7 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
             blocks += _histograms_and_curves(key, records, units)
         elif isinstance(value, (list, Mapping)) and (series := _named_series(key, value)):
             blocks.append(Figure(title_of(key), "".join(curve(name, ys) for name, ys in series.items())))
-        else:
+        elif value not in ([], {}):
             notes.append(f"{title_of(key)}: in the object, not shown here.")
     rows = [_scalar_row(name, value, unit_key, units, intervals, metrics) for name, value, unit_key in scalars]
     columns = ["metric", "value", "interval", "unit"]
@@ -121,7 +121,7 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
     if not grouped:
         return []
     records = _named_records(grouped)
-    made = [_records_table("metric", records, units)] if records else []
+    made = [_records_table("metric", records, units, _interval_note(found))] if records else []
     names = found.get("runs", [])
     if isinstance(names, list) and all(isinstance(own.get("values"), list) for own in grouped.values()):
         runs = [
@@ -134,7 +134,10 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
     changed = found.get("most_changed", {})
     for key, rows in changed.items() if isinstance(changed, Mapping) else ():
         if (records := _named_records(rows)) is not None:
-            made.append(_records_table(f"samples that differ most, by {title_of(key)}", records, {}))
+            unit = _unit_of(units, key)
+            made.append(
+                _records_table(f"samples that differ most, by {title_of(key)}", records, {"a": unit, "b": unit})
+            )
     return made
 
 
@@ -163,7 +166,7 @@ def _named_records(value: Any) -> list[tuple[str, Mapping]] | None:
     return records if any(name or _flatten_record(own) for name, own in records) else None
 
 
-def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> Table:
+def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping, note: str = "") -> Table:
     flat = [(name, _flatten_record(record)) for name, record in records]
     columns = list(dict.fromkeys(column for _, record in flat for column in record))
     named = any(name for name, _ in flat)
@@ -177,7 +180,7 @@ def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping)
     ]
     title = title_of(key.removeprefix("per_"))
     return table(
-        f"By {title}" if named or key.startswith("per_") else title[:1].upper() + title[1:], header, rows, key=key
+        f"By {title}" if named or key.startswith("per_") else title[:1].upper() + title[1:], header, rows, note, key
     )
 
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from dpcli.draw.bars import Bars, Histogram, draw_panels
+from dpcli.draw.sheet import shortened
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import SegmentationReport
 from dpcli.evaluate.segmentation.tables import class_rows
 
 _SHOWN = ("ap", "pq", "f1", "miou", "ri")
+_LONGEST_TITLE = 32  # characters of a class and its number
 
 
 def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
     """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
     values = {title_of(key): [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
-    bars = Bars([f"{title} ({own.objects})" for title, own in rows], values, "%", 100)
+    bars = Bars([_counted(title, own.objects) for title, own in rows], values, "%", 100)
     spread = Histogram(100 * report.objects.object_iou, "mIoU of a sequence, %", "sequences")
     draw_panels([bars, spread], len(rows), f"Parts, protocol {report.protocol}, split {report.split}", path)
 
@@ -25,7 +27,7 @@ def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
 def draw_motion_bars(report: MotionReport, path: Path) -> None:
     """Draws the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
     rows = class_rows(report.main, report.classes, report.class_names)
-    titles = [f"{title} ({own.pairs})" for title, own in rows]
+    titles = [_counted(title, own.pairs) for title, own in rows]
     errors = {"EPE3D": [own.epe3d for _, own in rows], "predicting no motion": [own.still for _, own in rows]}
     shares = {
         f"{name} {tau:g}": [100 * getattr(own.shares[tau], name.lower()) for _, own in rows]
@@ -37,3 +39,7 @@ def draw_motion_bars(report: MotionReport, path: Path) -> None:
         Bars(titles, shares, "% of points", 100, cut=True),
     ]
     draw_panels(panels, len(rows), f"Flow, protocol {report.protocol}, split {report.split}", path)
+
+
+def _counted(title: str, count: int) -> str:
+    return f"{shortened(title, _LONGEST_TITLE)} ({count})"

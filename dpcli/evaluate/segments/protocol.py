@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.results import (
     LeftOut,
     intervals_json,
@@ -26,8 +27,6 @@ from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampl
 from dpcli.runtime.progress import log
 from dpcli.store.tables.segments import Segments
 
-_TITLES = {"frame_accuracy": "frame accuracy", "edit_score": "edit score"}
-_TITLES |= {f"f1_{overlap}": f"F1@{overlap}" for overlap in OVERLAPS}
 _NOTE = (
     "Frame accuracy: frames with the right class, or rightly with nothing. Edit score: 1 - Levenshtein distance of the orders "
     "of actions / the longer one. F1@k: a segment is right when it overlaps a true one of its class by k % of their union; "
@@ -82,9 +81,9 @@ def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: 
 def segments_tables(report: SegmentsReport) -> list[TextTable]:
     """Returns a table of the metrics of all recordings, and one with a row for each."""
     title = f"{100 * report.resampling.confidence:.4g} % interval"
-    rows = [[_TITLES[key], percent(report.metrics[key]), percent_ends(report.intervals.get(key))] for key in METRICS]
+    rows = [[title_of(key), percent(report.metrics[key]), percent_ends(report.intervals.get(key))] for key in METRICS]
     single = [[name, *_row(one)] for name, one in zip(report.names, report.counts)]
-    header = ["recording", "frames", "true segments", "predicted", *(_TITLES[key] for key in METRICS)]
+    header = ["recording", "frames", "true segments", "predicted", *(title_of(key) for key in METRICS)]
     return [TextTable("Segments", ["metric", "value", title], rows), TextTable("By recording", header, single)]
 
 

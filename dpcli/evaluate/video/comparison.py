@@ -89,6 +89,7 @@ def evaluate_video(
     UsageError for protocols and metrics there aren't.
     """
     chosen = protocol if isinstance(protocol, VideoProtocol) else video_protocol(protocol)
+    folder = weights_folder(weights)
     with closing(open_source(Path(truth))) as real, closing(open_source(Path(path), truth=real)) as predicted:
         names = _choose_metrics(metrics, predicted, real)
         pictured = [name for name in names if name in PICTURE_METRICS]
@@ -97,7 +98,9 @@ def evaluate_video(
         frames = FramePass(predicted, real, chosen, pictured, intersect, watch or (lambda *_: None), left_out)
         views = frames.score_views(pairs)
         learned_names = [name for name in names if name in LEARNED_METRICS]
-        learned, missing = _learned_scores(frames, learned_names, weights, device)
+        if weights is not None and not set(learned_names) - {"warping"}:
+            log.warn(f"--weights {weights}: nothing in it is read; none of the metrics asked for needs a network")
+        learned, missing = _learned_scores(frames, learned_names, folder, device)
         report = VideoReport(
             chosen,
             tuple(names),
@@ -127,12 +130,9 @@ def _intervals(report: VideoReport) -> dict[str, Interval]:
 
 
 def _learned_scores(
-    frames: FramePass, names: Sequence[str], weights: Path | None, device: str
+    frames: FramePass, names: Sequence[str], folder: Path, device: str
 ) -> tuple[dict[str, LearnedScore], dict[str, str]]:
     """Returns the scores of the learned metrics, and why others have none: a pass of its own, frames in order."""
-    folder = weights_folder(weights)
-    if weights is not None and not set(names) - {"warping"}:
-        log.warn(f"--weights {weights}: nothing in it is read; none of the metrics asked for needs a network")
     if not names:
         return {}, {}
     made, missing = load_metrics(names, frames.protocol.networks, folder, device)

@@ -51,6 +51,8 @@ def _small(colors: np.ndarray) -> np.ndarray:
     from PIL import Image
 
     image = Image.fromarray((np.nan_to_num(colors).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))
+    if max(image.size) < _SIDE:  # whole pixels
+        image = image.resize([side * (_SIDE // max(image.size)) for side in image.size], Image.Resampling.NEAREST)
     image.thumbnail((_SIDE, _SIDE))
     cell = np.full((_SIDE, _SIDE, 3), 0.5, np.float32)
     cell[: image.height, : image.width] = np.asarray(image, np.float32) / 255

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -120,3 +121,18 @@ def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words
     for text in calls:
         assert "bad.h5" in text and len(text.splitlines()) <= 2
         assert re.search(words, text), text
+
+
+def test_a_sample_is_left_out_once(run, tmp_path):
+    """The truth has it, and one of the two predictions: it is missing there, and not also a sample that was not scored."""
+    with CloudsWriter(tmp_path / "truth.h5", class_names=CLASSES, length_unit="m") as writer:
+        for i in range(7):
+            point = [np.zeros((1, 3), np.float32)]
+            writer.write(CloudSequence.from_frames(f"v{i}", point, label=i % 3, split="test"))
+    a, b = write_scores(tmp_path / "a.h5", {0}, 6), write_scores(tmp_path / "b.h5", {1}, 4)
+    words = ("compare", a, b, "--truth", tmp_path / "truth.h5", "--intersect", "--json", "--resamples", 0)
+    left_out = json.loads(run(*words))["left_out"]
+    assert [(own["reason"], own["names"]) for own in left_out] == [
+        ("not scored", ["v6"]),
+        (f"only in {a}", ["v4", "v5"]),
+    ]

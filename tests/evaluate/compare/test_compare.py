@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.bootstrap import Resampling
+from dpcli.evaluate.bootstrap import Resampling, bootstrap, means_of_samples
 from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, metrics_of_values
 from dpcli.evaluate.compare.paired import CompareReport, pair_metrics
@@ -21,7 +21,8 @@ from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
 from dpcli.evaluate.compare.result_json import compare_json
 from dpcli.evaluate.compare.significance_tests import mcnemar
 from dpcli.evaluate.results import LeftOut
-from dpcli.store import ScoresWriter
+from dpcli.evaluate.text_tables import resampling_note
+from dpcli.store import PartsReader, PartsWriter, ScoresWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scores_helpers import CLASSES, write_scores
 
@@ -242,3 +243,33 @@ def test_what_cannot_be_compared(run, scores, parts, tmp_path):
         run("compare", parts["truth"], parts["truth"])
     with pytest.raises(UsageError, match="--protocol and --ignore-below are for parts"):
         run("compare", scores["good"], scores["good"], "--ignore-below", 3)
+
+
+def test_rounding_is_no_difference(run, parts, tmp_path):
+    """The same sequences in another order: the sums of a mean differ in their last bit."""
+    turned = tmp_path / "turned.h5"
+    with (
+        PartsReader(parts["twin"]) as reader,
+        PartsWriter(turned, num_parts=4, length_unit=reader.length_unit) as writer,
+    ):
+        for row in (5, 2, 7, 0, 3, 6, 1, 4):
+            said = reader.read_parts(row)
+            sequence = reader.read(row, fields=("part",))
+            writer.write(sequence, said.probability, said.pairs, said.motion, said.flow)
+    words = run("compare", parts["twin"], turned, "--truth", parts["truth"], "--json", "--resamples", 200)
+    for own in json.loads(words)["metrics"].values():
+        assert (own["difference"], own["interval"], own["p"]) == (0, [0, 0], 1)
+
+
+def test_few_samples_are_said_to_make_intervals_too_narrow(run, parts, tmp_path):
+    """Eight sequences are few, sixty samples aren't; a bootstrap of two that agree says p < 0.001."""
+    text = run("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--resamples", 100)
+    assert "8 sequences are few for a bootstrap" in text and "can't be below 0.0078" in " ".join(text.split())
+    assert not any("few for" in line for line in resampling_note(Resampling(), "samples", 60))
+    assert any("9 samples are few" in line for line in resampling_note(Resampling(), "samples", 9))
+    covered, rng = 0, np.random.default_rng(0)
+    for _ in range(300):
+        metric = means_of_samples({"mean": rng.normal(size=4)})
+        ends = bootstrap(metric, 4, rng, resamples=300)["mean"]
+        covered += ends.low <= 0 <= ends.high
+    assert 0.75 < covered / 300 < 0.85  # as the sentence says

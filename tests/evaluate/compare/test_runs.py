@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 import math
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.evaluate.classification.protocol import evaluate_classification
+from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.compare.runs import mean_with_t_interval
+from dpcli.evaluate.report import collect
+from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+from dpcli.evaluate.segmentation.sequence_pass import Keeping
 from tests.support.scores_helpers import write_scores
 
 
@@ -132,3 +138,26 @@ def test_runs_of_video_results_need_no_names(run, tmp_path):
     path.write_text(json.dumps(own) + "\n" + json.dumps(own))
     assert json.loads(run("runs", path, "--json"))["metrics"]["ssim"]["mean"] is None
     assert "undefined in some runs" in run("runs", path)
+
+
+def test_scores_that_are_no_probabilities_have_no_further_metric(run, tmp_path):
+    """Their reliability diagram is null, which is no number, and a run of probabilities is the same experiment."""
+    objects = []
+    for seed, scale in enumerate((1, 3)):
+        path = write_scores(tmp_path / f"{seed}.h5", {seed}, seed=seed)
+        with h5py.File(path, "r+") as file:
+            file["scores"][...] *= scale
+        objects.append(classification_json(evaluate_classification(path), str(path)))
+    path = tmp_path / "runs.json"
+    path.write_text("\n".join(map(json.dumps, objects)))
+    found = json.loads(run("runs", path, "--json"))["metrics"]
+    assert list(found) == ["accuracy", "balanced_accuracy", "macro_f1", "calibration_error"]
+    assert found["calibration_error"]["mean"] is None and found["calibration_error"]["values"][1] is None
+
+
+def test_kept_statistics_say_how_to_become_a_result(run, parts, tmp_path):
+    kept = tmp_path / "kept.h5"
+    evaluate_segmentation(parts["good"], parts["truth"], keeping=Keeping(kept))
+    for words in (("runs", kept), ("compare", kept, kept), ("report", kept)):
+        with pytest.raises(DataError, match="evaluate segmentation FILE --json"):
+            collect([str(kept)]) if words[0] == "report" else run(*words)

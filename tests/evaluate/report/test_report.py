@@ -19,10 +19,14 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate.report import report as report_command
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.bootstrap import Resampling
+from dpcli.evaluate.classification.protocol import evaluate_classification
+from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
-from dpcli.evaluate.report.blocks import interval_text, sort_key, table, text_of
+from dpcli.evaluate.report.blocks import Table, interval_text, sort_key, table, text_of
 from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
 from dpcli.evaluate.report.markdown_and_latex import escape_latex
+from dpcli.store import CloudSequence, CloudsWriter, PartsWriter
 from tests.support.browser import needs_browser, open_page
 from tests.support.report_helpers import EVIL
 
@@ -101,6 +105,40 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
     assert piped.results[0].found == json.loads(json.dumps(found))
 
 
+@pytest.mark.parametrize(("resamples", "level"), [(200, "80 % interval of accuracy"), (0, "interval of accuracy")])
+def test_intervals_say_their_level_and_what_is_no_number_is_no_metric(scores, resamples, level):
+    """The scores are no probabilities: without a reliability diagram, which is no metric of its own."""
+    report = evaluate_classification(scores, resampling=Resampling(resamples, 0.8))
+    words = json.dumps(classification_json(report, "s.h5"))
+    (section,) = arrange(collect(["-"], stdin=BytesIO(words.encode()))).sections
+    tables = {own.key: own for own in section.blocks if isinstance(own, Table)}
+    assert tables["streams"].header[2] == level
+    assert [row[0].text for row in tables["metrics"].rows] == [
+        "accuracy",
+        "balanced accuracy",
+        "macro F1",
+        "calibration error",
+    ]
+
+
+def test_motion_is_shown_where_the_truth_has_scene_flow(tmp_path):
+    def written(pairs: np.ndarray) -> list[str]:
+        points = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
+        part = np.tile(np.repeat([0, 1], 10), 2).astype(np.int16)
+        sequence = CloudSequence("s", points, np.array([0, 20, 40]), part=part)
+        with PartsWriter(tmp_path / "p.h5", num_parts=2, length_unit="m", force=True) as writer:
+            writer.write(sequence, np.eye(2)[part], pairs, np.tile(np.eye(4), (1, 2, 1, 1)), [np.zeros((20, 3))])
+        sequence.scene_flow = np.full((40, 3), 0.1, np.float32)
+        with CloudsWriter(tmp_path / "t.h5", fields=("part", "scene_flow"), length_unit="m", force=True) as writer:
+            writer.write(sequence)
+        sections = arrange(collect([f"{tmp_path / 'p.h5'}={tmp_path / 't.h5'}"])).sections
+        return [*(f"{own.task} {own.headline.value.text}" for own in sections), *sections[0].notes]
+
+    assert written(np.array([[0, 1]])) == ["segmentation 100.0 %", "motion 0.1732"]
+    only, note = written(np.array([[1, 0]]))
+    assert only == "segmentation 100.0 %" and note.startswith("No motion: ") and "none of its 1 frame pairs" in note
+
+
 def test_comparisons_and_runs_have_a_row_for_each_metric():
     pair = {
         "task": "compare",
@@ -108,7 +146,12 @@ def test_comparisons_and_runs_have_a_row_for_each_metric():
         "units": {"accuracy": "fraction"},
         "provenance": [[{"command": "A"}], [{"command": "B"}]],
         "metrics": {"accuracy": {"a": 0.9, "b": 0.8, "difference": 0.1, "p": 0.03, "interval": [0.02, 0.2], "ties": 7}},
-        "intervals": {"resamples": 2000, "metrics": {"accuracy": [0.02, 0.2]}},
+        "intervals": {
+            "method": "paired bootstrap, percentile",
+            "resamples": 2000,
+            "confidence": 0.9,
+            "metrics": {"accuracy": [0.02, 0.2]},
+        },
         "mcnemar": {"only_a": 4, "only_b": 1, "p": 0.4},
         "most_changed": {"accuracy": [{"name": "v7", "a": 1.0, "b": 0.0}]},
     }
@@ -129,6 +172,8 @@ def test_comparisons_and_runs_have_a_row_for_each_metric():
     assert (first.headline.value.text, first.headline.interval) == ("10.0 %", "2.0 to 20.0 %")
     assert [own.key for own in first.blocks[1:]] == ["McNemar's exact test", "samples that differ most, by accuracy"]
     assert [[own.text for own in row] for row in second.blocks[1].rows] == [["seed 0", "80.0 %"], ["seed 1", "90.0 %"]]
+    assert [own.text for own in first.blocks[2].rows[0]] == ["v7", "100.0 %", "0.0 %"]
+    assert "Intervals: 90 %, paired bootstrap" in first.blocks[0].note
 
 
 @pytest.mark.parametrize(

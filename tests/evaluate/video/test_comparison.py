@@ -250,7 +250,7 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
     assert "over white" in result.stdout and "data range 1.0" in result.stdout
     with Image.open(strip) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
-    first = pixels[22 : 22 + 24, 4 : 4 + 32]  # truth of view 0, frame 0: pictures smaller than a cell keep their size
+    first = pixels[22 : 22 + 120 : 5, 4 : 4 + 160 : 5]  # truth of view 0, frame 0: 5 pixels for each, to fill the cell
     assert np.abs(first / 255 - white(clip()[0, 0]))[10:, 10:].max() < 0.01  # but for the frame's number
     assert isinstance(run(said, "--truth", truth, "--picture", tmp_path / "no" / "x.png").exception, DataError)
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks.clip import Clip
 from dpcli.evaluate.networks.lpips import Lpips
+from dpcli.evaluate.report import arrange, collect
 from dpcli.evaluate.video.comparison import evaluate_video
 from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
 from dpcli.evaluate.video.frechet.distance import feature_update, frechet_distance
@@ -257,6 +259,15 @@ def test_absent_weights_cost_only_their_own_metric(files, no_weights: Path) -> N
     found = json.loads(result.stdout)
     assert found["metrics"]["psnr"] > 20 and found["metrics"]["warping"] > 0
     assert found["metrics"]["lpips"] is None and set(found["not_computed"]) == {"lpips", "fvd"}
+    (section,) = arrange(collect(["-"], stdin=BytesIO(result.stdout.encode()), pictures=False)).sections
+    assert any(note.startswith("LPIPS not computed: ") and "fetch vgg16" in note for note in section.notes)
+
+
+def test_a_wrong_folder_of_weights_is_said_before_the_work(files) -> None:
+    seen: list = []
+    with pytest.raises(DataError, match="--weights nowhere: no such folder"):
+        evaluate_video(*files, metrics=("psnr", "lpips"), weights=Path("nowhere"), watch=lambda *own: seen.append(own))
+    assert not seen
 
 
 def test_the_thesis_compares_pixels_of_the_reference_and_features_of_all_views(files, fake_networks) -> None:
