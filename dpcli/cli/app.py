@@ -140,6 +140,9 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, DpcError):
         log.error(str(error))
         return error.exit_code
+    if isinstance(error, FileNotFoundError) and error.filename is None and _current_folder_is_gone():
+        log.error("the current folder was removed; change to one that exists (cd), then run the same command again")
+        return DataError.exit_code
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return DataError.exit_code
@@ -158,6 +161,14 @@ def _explain(error: BaseException) -> int:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return 1
     raise error
+
+
+def _current_folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _check_value(value: Any, option: Any) -> None:
