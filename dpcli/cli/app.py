@@ -149,6 +149,9 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        log.error("too many open files; allow more (ulimit -n 1024), or use fewer --jobs")
+        return 1
     named = error.filename if isinstance(error, OSError) else None
     full = disk_full(named or "the output", error, place=named) if isinstance(error, OSError) else None
     if full is not None:
