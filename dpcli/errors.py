@@ -60,4 +60,8 @@ def reading(where: object) -> Iterator[None]:
             raise
         said = (str(error).splitlines() or [""])[0][:200]
         what = f"{type(error).__name__}: {said}" if said else type(error).__name__
+        if isinstance(error, MemoryError):  # of a large file, or of a count in a damaged one
+            raise DataError(
+                f"{where}: too large for the memory there is, or damaged ({what}); free memory, or copy it again"
+            ) from error
         raise DataError(f"{where}: damaged, or of another format ({what}); make or copy it again") from error

@@ -140,12 +140,18 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, DpcError):
         log.error(str(error))
         return error.exit_code
+    if isinstance(error, FileNotFoundError) and error.filename is None and _current_folder_is_gone():
+        log.error("the current folder was removed; change to one that exists (cd), then run the same command again")
+        return DataError.exit_code
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return DataError.exit_code
     if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        log.error("too many open files; allow more (ulimit -n 1024), or use fewer --jobs")
+        return 1
     named = error.filename if isinstance(error, OSError) else None
     full = disk_full(named or "the output", error, place=named) if isinstance(error, OSError) else None
     if full is not None:
@@ -158,6 +164,14 @@ def _explain(error: BaseException) -> int:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return 1
     raise error
+
+
+def _current_folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _check_value(value: Any, option: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -63,7 +64,10 @@ def _converted(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int
     try:
         with reading(item.path), regular_files_only():
             sample = reader.read(item, rng)
-    except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):  # the machine's limit, which says nothing of the sample
+            raise
+        # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
     sample.sequence.validate_index()  # what a file or a list says of it
     sample.sequence = thinning.apply(sample.sequence, rng)  # our own code: what fails here is a bug

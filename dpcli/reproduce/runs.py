@@ -72,7 +72,7 @@ def attempt(work: Callable[[], object], what: str) -> str:
 def write_text(path: Path, text: str) -> None:
     """Writes a text file whole, in a folder that is made if need be; two jobs may write it at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text.encode(), many_writers=True)
+    write_whole(path, text.encode())
 
 
 def write_json(path: Path, value: object) -> None:

@@ -91,16 +91,16 @@ def put_in_place(part: Path, path: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
+def whole_file(path: Path) -> Iterator[Path]:
     """Yields the name to write to instead of `path`: beside it, hidden, with its suffix; renamed to it when the block ends.
 
-    The block may make a folder of that name. When it fails, nothing of it stays, and what was under `path` does.
-    many_writers: other processes may write `path` at the same time; the last one wins. Raises DiskFull where the disk is full.
+    The block may make a folder of that name. When it fails, nothing of it stays, and what was under `path` does. The name is
+    this process's own: of several that write `path` at the same time, the last one wins. Raises DiskFull where the disk is full.
     """
-    own = f".{os.getpid()}" if many_writers else ""
-    part = path.with_name(f".{path.name}{own}.part{path.suffix}")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
     check_regular(path)
-    _remove(part)  # a killed run may have left it
+    _remove(part)
+    _remove_killed(path)
     try:
         yield part
         put_in_place(part, path)
@@ -112,13 +112,33 @@ def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
         raise full from None
 
 
-def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> None:
+def write_whole(path: Path, content: bytes) -> None:
     """Writes a file through `whole_file`. Raises DataError when it can't be written, DiskFull where the disk is full."""
     try:
-        with whole_file(path, many_writers=many_writers) as part:
+        with whole_file(path) as part:
             part.write_bytes(content)
     except OSError as error:
         raise not_writable(path, error) from None
+
+
+def _remove_killed(path: Path) -> None:
+    """Removes what killed processes of this machine left of a file or folder that they were writing."""
+    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.part{re.escape(path.suffix)}")
+    with suppress(OSError), os.scandir(path.absolute().parent) as beside:
+        for one in beside:
+            found = name.fullmatch(one.name)
+            if found and not _is_running(int(found[1])):
+                _remove(Path(one.path))
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's, or no number of a process
+        return True
+    return True
 
 
 def not_writable(path: Path, error: OSError) -> DataError:

@@ -192,6 +192,13 @@ def test_a_full_disk_is_no_bug(number, said, capsys):
     assert "3: " in capsys.readouterr().err
 
 
+def test_too_many_open_files_are_no_bug(capsys):
+    for number in (errno.EMFILE, errno.ENFILE):
+        for named in ((), ("a.h5",)):
+            assert cli._explain(OSError(number, os.strerror(number), *named)) == 1
+            assert capsys.readouterr().err.startswith("dpc: error: too many open files; allow more (ulimit -n 1024)")
+
+
 REPLACING = [
     "classify predict good.h5 --model run -o",
     "classify explain pac good.h5 --model run -o",

@@ -403,6 +403,15 @@ def test_closed_streams_and_pipes_in_the_place_of_files(named, line, code, said)
     assert bool(said) == bool(done.stderr) and named.read_bytes() == before and "Exception" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    "words", ["info F --page x.html", "evaluate report F -o x.html", "evaluate classification F --picture x.png"]
+)
+def test_a_current_folder_that_was_removed_is_said(named, tmp_path, words):
+    done = shell(f"cd {tmp_path}; mkdir gone; cd gone; rmdir ../gone; DPC {words}", named)
+    assert done.returncode == 3 and done.stderr.startswith("dpc: error: the current folder was removed; "), done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_what_a_terminal_can_not_show_is_spelled(named):
     ascii_only = {"PYTHONUTF8": "0", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0"}
     for line in ("DPC info F", "DPC evaluate classification F", "DPC evaluate classification F --markdown"):

@@ -195,7 +195,7 @@ def test_a_journal_gives_back_what_went_in(tmp_path):
 def test_of_two_writers_of_one_file_the_second_is_refused(tmp_path):
     with CloudsWriter(tmp_path / "a.h5", **options()) as writer:
         writer.write(sequence(0))
-        with pytest.raises(DpcError, match="another dpc is writing it"):
+        with pytest.raises(DpcError, match=r"^\S+/a\.h5: cannot write \(another dpc is writing it"):
             CloudsWriter(tmp_path / "a.h5", **options())
         writer.write(sequence(1))
     with CloudsReader(tmp_path / "a.h5") as reader:

@@ -1,5 +1,6 @@
 """Input folders with what can't be opened or read: each is skipped by name, and the others go on."""
 
+import errno
 import io
 import os
 import re
@@ -23,6 +24,7 @@ from dpcli.prepare.cloud_formats.arrays import read_npz
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item
 from dpcli.prepare.recordings.recording import find_recordings
 from dpcli.prepare.scans.clouds import CloudFolders
@@ -46,6 +48,28 @@ class _Raising:
 def test_whatever_a_reader_raises_is_a_bad_sample_with_its_type(error):
     with pytest.raises(DataError, match=f"v.bin.*{type(error).__name__}"):
         convert_item(_Raising(error), Thinning(0), 0, (0, Item("v", Path("v.bin"))))
+
+
+def test_a_want_of_memory_is_not_called_damage_alone():
+    with pytest.raises(DataError, match="^v.bin: too large for the memory there is, or damaged "):
+        convert_item(_Raising(MemoryError("x")), Thinning(0), 0, (0, Item("v", Path("v.bin"))))
+
+
+class Greedy(ToyReader):
+    """Has no file left to open for its last sample."""
+
+    def read(self, item, rng):
+        if item.name == self.items()[-1].name:
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), "frame.bin")
+        return super().read(item, rng)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_too_many_open_files_are_no_fault_of_a_sample(jobs, tmp_path):
+    """A sample that is skipped for them is missing in the finished file for good."""
+    with pytest.raises(OSError, match="oo many open files"):
+        convert(Greedy(), tmp_path / "a.h5", Conversion(jobs=jobs))
+    assert not (tmp_path / "a.h5").exists()
 
 
 def test_errors_of_our_own_pass_the_guard():

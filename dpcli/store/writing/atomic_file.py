@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import h5py
 
 from dpcli.errors import DataError, DpcError
+from dpcli.file_lock import open_alone
 from dpcli.runtime.whole_file import check_regular, disk_full, not_writable, put_in_place
 
 
@@ -44,20 +44,33 @@ class AtomicFile:
         if self.target.is_dir():
             raise DataError(f"{self.target}: is a folder; name a file in it")
         check_regular(self.target)
+        self._lock = -1
         try:
-            self.file = _HeldOpen(self.part, "w")
+            self._lock = open_alone(self.part)
+            self.file = self._open()
             self.handle, self._written_out = self.file.id.get_vfd_handle(), 0
+        except DpcError:
+            raise DpcError(f"{self.target}: cannot write (another dpc is writing it)") from None
         except OSError as error:
-            busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
-            if not busy:
+            if self._lock != -1:
                 with suppress(OSError):  # the first byte did not fit: an empty file would stay
                     self.part.unlink(missing_ok=True)
-            full = None if busy else self.problem(error)
-            if full is not None:
-                raise full from None
-            if not busy:
-                raise not_writable(self.target, error) from None
-            raise DpcError(f"{self.target}: cannot write (another dpc is writing it)") from None
+                self._unlock()
+            raise self.problem(error) or not_writable(self.target, error) from None
+
+    def _open(self) -> _HeldOpen:
+        """Opens the locked file without HDF5's own lock: HDF5 empties a file before it asks whether another writes it."""
+        try:
+            return _HeldOpen(self.part, "w", locking=False)
+        except BlockingIOError:  # HDF5_USE_FILE_LOCKING=TRUE: HDF5 locks all the same, and ours is in its way
+            self._unlock()
+            return _HeldOpen(self.part, "w")
+
+    def _unlock(self) -> None:
+        """Lets others write under this name again, once the unfinished file is renamed, removed or left to be continued."""
+        if self._lock != -1:
+            os.close(self._lock)
+            self._lock = -1
 
     def __enter__(self) -> h5py.File:
         return self.file
@@ -101,6 +114,7 @@ class AtomicFile:
             self.file.flush()
             self.file.close()
             put_in_place(self.part, self.target)
+            self._unlock()
         except (OSError, RuntimeError) as error:
             worded = self.problem(error, kept)
             if worded is not None:
@@ -109,12 +123,14 @@ class AtomicFile:
                 self.discard()
             else:
                 self._close()
+                self._unlock()
             raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def discard(self) -> None:
         """Closes and removes the unfinished file."""
         self._close()
         self.part.unlink(missing_ok=True)
+        self._unlock()
 
     def _close(self) -> None:
         try:
@@ -131,6 +147,7 @@ class AtomicFile:
             self._let_go()
         if kept:
             self._close()
+            self._unlock()
         else:
             self.discard()
         if worded is not None:

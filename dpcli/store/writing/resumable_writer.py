@@ -95,6 +95,8 @@ class ResumableWriter(ABC):
         ):  # AtomicFile explains what is wrong otherwise
             try:
                 before = Journal(journal_path(self.path), self._about())
+            except DpcError:  # it names the journal, which nobody knows
+                raise DpcError(f"{self.path}: cannot write (another dpc is writing it)") from None
             except OSError as error:
                 raise disk_full(self.path, error) or not_writable(self.path, error) from None
         try:

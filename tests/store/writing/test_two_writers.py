@@ -1,0 +1,111 @@
+"""Two processes that write one file: what the first one made is whole under its name, whatever the second one does."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from dpcli.runtime import whole_file as module
+from dpcli.runtime.whole_file import put_in_place, whole_file
+from dpcli.store.writing import atomic_file
+from dpcli.store.writing.atomic_file import AtomicFile
+from tests.support.prepare_helpers import ROOT
+
+OTHER = """
+import sys
+from pathlib import Path
+from dpcli.errors import DpcError
+from dpcli.store.writing.atomic_file import AtomicFile
+try:
+    AtomicFile(sys.argv[1]).discard()
+except DpcError as error:
+    print(error)
+"""
+STOPPED = """
+import os, sys
+from pathlib import Path
+from dpcli.runtime.whole_file import whole_file
+with whole_file(Path(sys.argv[1])) as part:
+    part.write_text("half")
+    print("half", flush=True)
+    sys.stdin.read()
+"""
+
+
+def python(code: str, *words: object, **env: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, words)],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **env},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize("moment", ["in the middle", "as it is brought to the disk"])
+@pytest.mark.parametrize("locking", ["", "TRUE", "FALSE"])
+def test_a_second_writer_of_an_hdf5_file_is_refused_before_it_empties_the_first_ones(
+    moment, locking, tmp_path, monkeypatch
+):
+    path, said = tmp_path / "a.h5", []
+
+    def bring(part: Path, target: Path) -> None:
+        if moment == "as it is brought to the disk":
+            said.append(python(OTHER, path, HDF5_USE_FILE_LOCKING=locking).stdout)
+        put_in_place(part, target)
+
+    monkeypatch.setattr(atomic_file, "put_in_place", bring)
+    with AtomicFile(path) as file:
+        file["a"] = np.arange(10**5)
+        file.flush()
+        if moment == "in the middle":
+            said.append(python(OTHER, path, HDF5_USE_FILE_LOCKING=locking).stdout)
+    assert said == [f"{path}: cannot write (another dpc is writing it)\n"]
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(file["a"][()], np.arange(10**5))
+    assert os.listdir(tmp_path) == ["a.h5"]
+    assert python(OTHER, path).stdout == ""  # the first one is done
+
+
+def test_hdf5_that_is_told_to_lock_writes_all_the_same(tmp_path):
+    code = "import sys; from dpcli.store.writing.atomic_file import AtomicFile\nwith AtomicFile(sys.argv[1]) as file: file['a'] = 1"
+    done = python(code, tmp_path / "a.h5", HDF5_USE_FILE_LOCKING="TRUE")
+    assert (done.returncode, done.stderr, os.listdir(tmp_path)) == (0, "", ["a.h5"])
+
+
+def test_of_two_writers_of_another_file_the_last_one_wins_and_a_killed_one_leaves_nothing(tmp_path):
+    path = tmp_path / "a (1).html"
+    other = subprocess.Popen(
+        [sys.executable, "-c", STOPPED, path],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdout.readline() == "half\n"
+    with whole_file(path) as part:
+        part.write_text("whole")
+    assert path.read_text() == "whole" and len(os.listdir(tmp_path)) == 2
+    other.kill()
+    other.communicate()
+    with whole_file(path) as part:
+        part.write_text("again")
+    assert path.read_text() == "again" and os.listdir(tmp_path) == [path.name]
+
+
+def test_what_only_looks_like_the_rest_of_a_killed_run_stays(tmp_path, monkeypatch):
+    """Of a process that runs, of another file, or with a number that is no process's."""
+    monkeypatch.setattr(module.os, "getpid", lambda: 7)
+    names = [f".a.html.{os.getppid()}.part.html", ".b.html.999999999.part.html", f".a.html.{10**30}.part.html"]
+    for name in names:
+        (tmp_path / name).write_text("kept")
+    (tmp_path / ".a.html.999999999.part.html").mkdir()
+    with whole_file(tmp_path / "a.html") as part:
+        part.write_text("whole")
+    assert sorted(os.listdir(tmp_path)) == sorted([*names, "a.html"])
