@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_OF_PATCH = 3  # points that a patch has at least, in the mean
+_OF_PATCH = 3  # points, in the mean, from which on patches tell themselves how far they bend
+_GROUP, _STIFF = 5, 0.25  # points beside one another that tell it else; which quantile of the groups does
+_FEWEST = 6  # points that can be two parts
 _FRAMES = 32  # of a long clip, evenly spaced
 _NEIGHBORS = 8  # points whose patches touch
 _TRAVEL = 3.0  # weight of motion beside position where patches and neighbors are chosen
@@ -71,9 +73,9 @@ def find_parts(
 
     Points in one part move almost rigidly over the whole clip and lie together. Their number follows from what a further
     part explains, up to `most`; the first is the largest. Other points go with the trusted one that stays nearest.
-    patches: how many are joined, at most; smaller parts than one are lost. softness: how far parts may bend, 1 as animals'
-    skin does; of things that hardly bend within patches, smaller motions tell parts apart. weights: f (T,N) above 0, how
-    much a point's place in a frame counts; in the first frame it always does in full.
+    patches: how many are joined, at most, single points where there are no more; smaller parts than one are lost. softness:
+    how far parts may bend, 1 as animals' skin does; of things that hardly bend within patches, smaller motions tell parts
+    apart. weights: f (T,N) above 0, how much a point's place in a frame counts; in the first frame it always does in full.
     """
     from scipy.spatial import cKDTree
 
@@ -82,7 +84,7 @@ def find_parts(
     frames, weights = frames[few].astype(np.float64), weights[few][:, trusted]
     own = frames[:, trusted]
     diameter = np.linalg.norm(np.ptp(own[0], axis=0))
-    if len(own[0]) < 2 * _NEIGHBORS or most < 2 or not diameter > 0:
+    if len(own[0]) < _FEWEST or most < 2 or not diameter > 0:
         return np.zeros(frames.shape[1], np.int64)
     own = (own - own.mean(1, keepdims=True)) / diameter
     label = _join(own, weights, _patches(own, patches), most, softness)
@@ -101,10 +103,8 @@ def _join(
 ) -> np.ndarray:  # [M]
     """Returns the part of each point: patches joined by motion and extent, then parts that move alike by motion alone."""
     sums, touching = _sums(own, weights, patch), _touching(own, patch)
-    free = 3 * sums.count.mean(1) - 6  # numbers of a patch that its rigid motion leaves
-    bend = np.median((sums.cost(0.0) / free.clip(1))[free > 0]) if (free > 0).any() else 0.0
     most_price = _PRICE * softness**2
-    price = float(np.clip(_OF_BEND * bend, min(_LEAST, most_price), most_price))
+    price = float(np.clip(_OF_BEND * _bend(own, weights, sums), min(_LEAST, most_price), most_price))
     # where hardly anything moves or bends, extent would be all that counts
     compact = _COMPACT * price / _PRICE * min(sums.whole().cost(0.0)[0] / len(patch) / _MOVES, 1.0)
     part = _Joining(sums, touching, compact).run(price * len(patch), most)
@@ -114,16 +114,40 @@ def _join(
     return joining.run(_SAME * price * len(patch), most)[part][patch]
 
 
+def _bend(own: np.ndarray, weights: np.ndarray, sums: _Sums) -> float:
+    """Returns how far patches of these sums bend, or noise moves their points: what rigid motions leave, squared, per number.
+
+    Patches of fewer points than hold a motion can't tell; then the stiffer ones of groups of five points do, a point and
+    those that lie and go beside it.
+    """
+    from scipy.spatial import cKDTree
+
+    if own.shape[1] >= _OF_PATCH * len(sums.count):
+        free = 3 * sums.count.mean(1) - 6  # numbers of a patch that its rigid motion leaves
+        return float(np.median((sums.cost(0.0) / free.clip(1))[free > 0])) if (free > 0).any() else 0.0
+    feature = _feature(own)
+    groups = cKDTree(feature).query(feature, _GROUP)[1]
+    one = np.zeros(_GROUP, np.int64)
+    left = [_sums(own[:, group], weights[:, group], one).cost(0.0)[0] for group in groups]
+    return float(np.quantile(left, _STIFF)) / (3 * _GROUP - 6)
+
+
+def _feature(own: np.ndarray) -> np.ndarray:  # [T, M, 3] -> [M, D]
+    """Returns where points are in the first frame and how they travel, by which near ones lie and go together."""
+    few = own[:: max(len(own) // 8, 1)]
+    return np.concatenate([own[0], *(_TRAVEL / len(few) ** 0.5 * (few - few.mean(0)))], 1)
+
+
 def _patches(own: np.ndarray, most: int) -> np.ndarray:  # [T, M, 3] -> [M]
     """Returns small patches of points that lie together and go together: k-means from spread places."""
     from scipy.cluster.vq import kmeans2
 
     from dpcli.ops import fps_numpy
 
-    few = own[:: max(len(own) // 8, 1)]
-    travel = few - few.mean(0)
-    feature = np.concatenate([own[0], *(_TRAVEL / len(few) ** 0.5 * travel)], 1)
-    start = feature[fps_numpy(own[0], min(most, len(feature) // _OF_PATCH))]
+    feature = _feature(own)
+    if len(feature) <= most:
+        return np.arange(len(feature))
+    start = feature[fps_numpy(own[0], most)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a patch that lost all its points isn't missed
         label = kmeans2(feature, start, iter=10, minit="matrix")[1]
@@ -135,8 +159,9 @@ def _touching(own: np.ndarray, patch: np.ndarray) -> set[tuple[int, int]]:
     from scipy.spatial import cKDTree
 
     place = np.concatenate(list(own[:: max(len(own) // 4, 1)]), 1)
-    near = patch[cKDTree(place).query(place, _NEIGHBORS + 1)[1][:, 1:]]
-    pairs = np.stack([np.repeat(patch, _NEIGHBORS), near.ravel()], 1)
+    count = min(_NEIGHBORS, max(3, len(patch) // 3 - 1))  # of few points, not all
+    near = patch[cKDTree(place).query(place, count + 1)[1][:, 1:]]
+    pairs = np.stack([np.repeat(patch, count), near.ravel()], 1)
     return {(int(a), int(b)) for a, b in np.unique(np.sort(pairs, 1), axis=0) if a != b}
 
 
