@@ -159,7 +159,7 @@ def _touching(own: np.ndarray, patch: np.ndarray) -> set[tuple[int, int]]:
     from scipy.spatial import cKDTree
 
     place = np.concatenate(list(own[:: max(len(own) // 4, 1)]), 1)
-    count = min(_NEIGHBORS, max(3, len(patch) // 3 - 1))  # of few points, not all
+    count = min(_NEIGHBORS, len(patch) - 1)
     near = patch[cKDTree(place).query(place, count + 1)[1][:, 1:]]
     pairs = np.stack([np.repeat(patch, count), near.ravel()], 1)
     return {(int(a), int(b)) for a, b in np.unique(np.sort(pairs, 1), axis=0) if a != b}
