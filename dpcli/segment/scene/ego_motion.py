@@ -13,6 +13,7 @@ _SCALES = ((1.0, 3.0), (0.5, 1.2), (0.3, 0.5))  # voxel and farthest partner, me
 _STEP = 2.5  # meters between the starts of the search
 _STEPS = {0: 20, 1: 20, 2: 30}
 _BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
+_DIGITS = 9  # of a motion that are kept: Open3D adds in the order in which threads end, and the last digits differ
 _NEAR = 0.5  # meters: a point this near to the other frame's has a partner
 OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
 
@@ -73,7 +74,8 @@ def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:
     farthest = _SCALES[scale][1]
     loss = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(farthest / 2))
     criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, _STEPS[scale])
-    return registration.registration_icp(source, target, farthest, start, loss, criteria).transformation.copy()
+    found = registration.registration_icp(source, target, farthest, start, loss, criteria).transformation
+    return np.round(found, _DIGITS) + 0.0  # no -0
 
 
 def _misfit(source, tree: cKDTree, motion: np.ndarray) -> tuple[float, float]:

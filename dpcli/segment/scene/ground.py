@@ -43,7 +43,8 @@ def find_up(points: np.ndarray, sensor: np.ndarray | None, seed: int = 0) -> tup
     for _ in range(_PLANES):
         if len(rest.points) < max(50, _LEAST * len(thin)):
             break
-        plane, inside = rest.segment_plane(0.15, 3, 300)
+        # probability 1: all 300 draws, as stopping early depends on which thread was first
+        plane, inside = rest.segment_plane(0.15, 3, 300, probability=1.0)
         score, normal = _judge_plane(np.array(plane), len(inside) / len(thin), thin, sight, axis)
         flatness = np.abs(normal) @ (extent.max() / np.maximum(extent, 1.0))  # normals along the thin side of a scene
         if score * flatness > best:
