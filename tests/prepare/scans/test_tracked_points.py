@@ -203,6 +203,10 @@ def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., st
     assert 0 == exit_code(
         "prepare", "synthetic", "animal", "-o", tmp_path / "bare.h5", "--size", "16", "--frames", "2", "--tracks", "0"
     )
+    other = ("prepare", "clouds", tmp_path / "views.h5", "-o", tmp_path / "none.h5")
+    assert "leave out --axes" in refused(*other, "--axes", "TNC") and "leave out --axes" in refused(
+        *other, "--gap", "2"
+    )
     assert "views without true tracks" in refused("prepare", "clouds", tmp_path / "bare.h5", "-o", tmp_path / "none.h5")
 
 

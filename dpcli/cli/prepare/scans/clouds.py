@@ -11,6 +11,7 @@ import typer
 from dpcli.cli.help_groups import LABELS
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
+from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
     from dpcli.prepare.scans.array_sequences import ArraySequences
@@ -145,6 +146,11 @@ def _make_reader(
     from dpcli.store.file import file_kind
 
     if made_by_dpc(raw) and file_kind(raw) == "views":
+        if units.axes or units.bin_columns or pattern or topic or table != TableColumns():
+            raise UsageError(
+                f"{raw}: holds views, whose tracks are read as they are; leave out --axes, --bin-columns, --pattern, --topic and"
+                " the options of tables"
+            )
         return TrackedViews(raw, **shared)
     if topic or holds_only_recordings(raw, SUFFIXES):
         return RecordedClouds(raw, topic, **shared)
