@@ -28,7 +28,6 @@ from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden
-from dpcli.store.schema import kept_names
 
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
@@ -67,20 +66,11 @@ def _is_array(name: str) -> bool:
 @dataclass(frozen=True)
 class ArraySequences(OwnScans):
     """Reads arrays of many clouds. axes: their letters, as `axes.check_axes` has them, "" where shapes and values tell; the
-    rest as `CloudFolders` has it.
+    rest as `OwnScans` has it.
     """
 
-    raw: Path
     axes: str = ""
-    scale: float | None = None
-    unit: str = "m"
-    fps: float | None = None
-    stride: int = 1
-    label_from_folder: bool = False
-    labels: Path | None = None
-    keep: tuple[str, ...] = ()
     pattern: str = ""
-    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -90,8 +80,7 @@ class ArraySequences(OwnScans):
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
         time, color = self._first
-        tracked = ("track",) if self.track else ()
-        return (("time",) if time else ()) + (("color",) if color else ()) + tracked + kept_names(self.keep)
+        return self.fields_beside(time=time, color=color)
 
     @cached_property
     def _paths(self) -> dict[str, Path]:

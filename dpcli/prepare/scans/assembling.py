@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
-from dpcli.prepare.labels import LabelTable
+from dpcli.prepare.labels import LabelTable, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
-from dpcli.store.schema import METERS, kept_name
+from dpcli.store.schema import METERS, kept_name, kept_names
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
@@ -61,21 +62,36 @@ class Lengths:
         return METERS[self.unit] / METERS[name], {note: 1}
 
 
+@dataclass(frozen=True)
 class OwnScans:
-    """Holds what the readers of people's own scans share, whose dataclass fields these are: one check of their options, the
-    classes of their table of labels, the unit, and what the provenance tells.
+    """Holds what the readers of people's own scans share: their options and one check of these, the classes of their table of
+    labels, the unit, and what the provenance tells.
+
+    scale: input units per unit of length in the output; stride: every how many frames one is kept; keep: further columns;
+    track: what tells which points of two frames are one (`tracked_points.identify`).
     """
 
-    scale: float | None
-    unit: str
-    fps: float | None
-    label_from_folder: bool
-    labels: Path | None
-    track: str
-    _table: LabelTable | None
+    raw: Path
+    scale: float | None = None
+    unit: str = "m"
+    fps: float | None = None
+    stride: int = 1
+    label_from_folder: bool = False
+    labels: Path | None = None
+    keep: tuple[str, ...] = ()
+    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
+
+    @cached_property
+    def _table(self) -> LabelTable | None:
+        return read_labels(self.labels) if self.labels else None
+
+    def fields_beside(self, *, time: object, color: object) -> tuple[str, ...]:
+        """Returns the optional fields that every sample has, given whether all have times, and colors."""
+        told = {"time": time, "color": color, "track": self.track}
+        return (*(name for name, known in told.items() if known), *kept_names(self.keep))
 
     def check_options(self) -> None:
         """Raises UsageError for options that exclude each other, or a scale or a rate that is no positive number."""

@@ -21,7 +21,6 @@ from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
 from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import Series, about_series
-from dpcli.store.schema import kept_names
 
 _LISTED = 8
 _LOOKED_AT = 5  # frames that tell how many columns a .bin has
@@ -29,19 +28,12 @@ _LOOKED_AT = 5  # frames that tell how many columns a .bin has
 
 @dataclass(frozen=True)
 class CloudFolders(OwnScans):
-    """Reads point cloud files. ``scale``: input units per unit of length in the output; ``keep``: further columns."""
+    """Reads point cloud files. bin_columns: float32 values of a point in a .bin, None where the values tell; pattern: of the names
+    of frames, "" for any; the rest as `OwnScans` has it.
+    """
 
-    raw: Path
     bin_columns: int | None = None
-    scale: float | None = None
-    unit: str = "m"
-    fps: float | None = None
-    stride: int = 1
-    label_from_folder: bool = False
-    labels: Path | None = None
-    keep: tuple[str, ...] = ()
     pattern: str = ""
-    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -51,9 +43,7 @@ class CloudFolders(OwnScans):
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
-        kept = kept_names(self.keep)
-        tracked = ("track",) if self.track else ()
-        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + tracked + kept
+        return self.fields_beside(time=self._timed, color=self._has_color)
 
     @property
     def config(self) -> dict[str, Any]:

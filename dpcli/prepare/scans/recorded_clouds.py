@@ -19,7 +19,6 @@ from dpcli.prepare.recordings.recording import find_recordings, open_recording, 
 from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.tracked_points import identify, with_track
-from dpcli.store.schema import kept_names
 
 _WANTED = "clouds (PointCloud2, or CustomMsg of Livox)"
 _LISTED = 8
@@ -27,24 +26,14 @@ _LISTED = 8
 
 @dataclass(frozen=True)
 class RecordedClouds(OwnScans):
-    """Reads the clouds of ``topic`` in a recording, or in those below a folder; the rest as `CloudFolders` has it."""
+    """Reads the clouds of ``topic`` in a recording, or in those below a folder; the rest as `OwnScans` has it."""
 
-    raw: Path
     topic: str = ""
-    scale: float | None = None
-    unit: str = "m"
-    fps: float | None = None
-    stride: int = 1
-    label_from_folder: bool = False
-    labels: Path | None = None
-    keep: tuple[str, ...] = ()
-    track: str = ""
 
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has: time, color when the very first cloud has it, what is kept."""
-        tracked = ("track",) if self.track else ()
-        return ("time", *(("color",) if self._has_color else ()), *tracked, *kept_names(self.keep))
+        return self.fields_beside(time=True, color=self._has_color)
 
     @cached_property
     def _names(self) -> dict[str, Path]:

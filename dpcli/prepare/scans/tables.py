@@ -32,7 +32,6 @@ from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
 from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
 from dpcli.runtime.clips.other_files import stand_in
-from dpcli.store.schema import kept_names
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc", ".trc")
 MIXED = (
@@ -44,22 +43,13 @@ _FEW = 5  # frames of one point that may be true
 
 @dataclass(frozen=True)
 class TableSequences(OwnScans):
-    """Reads one table, or those of a folder. frame_column: "" for the one whose name says it; the rest as `CloudFolders`
+    """Reads one table, or those of a folder. frame_column: "" for the one whose name says it; the rest as `OwnScans`
     and `split_rows` have it.
     """
 
-    raw: Path
     frame_column: str = ""
     sequence_column: str = ""
     gap: float | None = None
-    scale: float | None = None
-    unit: str = "m"
-    fps: float | None = None
-    stride: int = 1
-    label_from_folder: bool = False
-    labels: Path | None = None
-    keep: tuple[str, ...] = ()
-    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -69,10 +59,8 @@ class TableSequences(OwnScans):
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has."""
-        kept = kept_names(self.keep)
         color, time = self._found
-        tracked = ("track",) if self.track else ()
-        return (("time",) if time else ()) + (("color",) if color else ()) + tracked + kept
+        return self.fields_beside(time=time, color=color)
 
     @cached_property
     def _paths(self) -> dict[str, Path]:

@@ -13,7 +13,6 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.labels import LabelTable, read_labels
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.times_of_tables import Table
@@ -123,18 +122,8 @@ def _is_number(word: str) -> bool:
 @dataclass(frozen=True)
 class TrackedViews(OwnScans):
     """Reads the true tracks of a `views` file, such as of an animated mesh, as a cloud of M points in every frame, with their
-    identities and parts; the options are those of `CloudFolders`. Lengths are the views file's.
+    identities and parts; the options are those of `OwnScans`. Lengths are the views file's.
     """
-
-    raw: Path
-    scale: float | None = None
-    unit: str = "m"
-    fps: float | None = None
-    stride: int = 1
-    label_from_folder: bool = False
-    labels: Path | None = None
-    keep: tuple[str, ...] = ()
-    track: str = ""
 
     def __post_init__(self) -> None:
         self.check_options()
@@ -142,10 +131,6 @@ class TrackedViews(OwnScans):
             raise UsageError(
                 f"{self.raw}: holds views and their true tracks; leave out --keep-fields, --label-from-folder, --track"
             )
-
-    @cached_property
-    def _table(self) -> LabelTable | None:
-        return read_labels(self.labels) if self.labels else None
 
     @cached_property
     def fields(self) -> tuple[str, ...]:

@@ -153,10 +153,10 @@ def _make_reader(
             )
         return TrackedViews(raw, **shared)
     if topic or holds_only_recordings(raw, SUFFIXES):
-        return RecordedClouds(raw, topic, **shared)
+        return RecordedClouds(raw, topic=topic, **shared)
     of_tables = table != TableColumns() or (units.track == COLUMNS and raw.is_dir())
     if (raw.is_file() and raw.suffix.lower() in TABLES) or of_tables:
-        return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
+        return TableSequences(raw, **vars(table), **shared)
     if units.axes or holds_sequences(raw, SUFFIXES):
-        return ArraySequences(raw, units.axes, pattern=pattern, **shared)
+        return ArraySequences(raw, axes=units.axes, pattern=pattern, **shared)
     return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)
