@@ -31,6 +31,7 @@ ROUNDED = "sequences whose frame column seems rounded by float32, which makes on
 _SPARSE = 2**30
 _EXACT = 2**53  # up to here every whole number is a float64
 _FULL = (2**8, 2**16, 2**32)  # what a counter of 8, 16 or 32 bits never reaches
+SILENT = "frame numbers without a row, as of frames in which nothing was seen; their neighbors follow each other (--fps keeps the times)"
 JOINED = "frames whose rows were joined, as their numbers come again later (--gap N begins a new sequence there)"
 
 
@@ -48,6 +49,16 @@ class Rows:
     clock: bool = False
     joined: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def silent(self) -> int:
+        """Returns how many numbers are missing between those of the frames, where most of these are one step apart; else 0."""
+        numbers = self.frames
+        if numbers is None or self.clock or len(numbers) < 3 or (numbers != np.floor(numbers)).any():
+            return 0
+        steps = np.diff(numbers).astype(np.int64)
+        step = int(np.gcd.reduce(steps))
+        return int((steps // step - 1).sum()) if step and 2 * np.count_nonzero(steps == step) > len(steps) else 0
 
     def times(self, column: str, fps: float | None) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (T): what the column tells, or its numbers by ``fps``; else None."""

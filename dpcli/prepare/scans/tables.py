@@ -27,7 +27,7 @@ from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import refuse_file
-from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
+from dpcli.prepare.scans.frames_of_tables import JOINED, SILENT, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
 from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
@@ -150,6 +150,8 @@ class TableSequences(OwnScans):
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
+        silent = 0 if time is not None or part.joined else part.silent
+        sample.notes |= {SILENT: silent} if silent else {}
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
         further = [] if self.track == COLUMNS else find_further_points(without(loaded.unused, self.keep))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.scans.frames_of_tables import FELL, JOINED, SINGLE, WRAPPED
+from dpcli.prepare.scans.frames_of_tables import FELL, JOINED, SILENT, SINGLE, WRAPPED
 from dpcli.prepare.scans.tables import MIXED, WIDE, TableSequences
 from dpcli.store import CloudsReader
 
@@ -303,3 +303,16 @@ def test_a_truncated_parquet_is_named(tmp_path):
     pytest.importorskip("pyarrow")
     (item,) = TableSequences(tmp_path / "a.parquet").items()
     assert "a.parquet: not a readable Parquet table" in item.problem
+
+
+@quick
+@given(st.sets(st.integers(0, 40), min_size=3), st.sampled_from([1, 2, 10]), st.integers(0, 5))
+def test_numbers_of_frames_without_rows_are_told(tmp_path, places, step, first):
+    numbers = [first + step * place for place in sorted(places)]
+    (sample,) = sequences(write(tmp_path / "log.csv", frames(*numbers)))
+    own = np.gcd.reduce(np.diff(numbers))
+    missing = (numbers[-1] - numbers[0]) // own + 1 - len(numbers)
+    steady = 2 * (np.diff(numbers) == own).sum() > len(numbers) - 1
+    assert sample.notes.get(SILENT, 0) == (missing if steady else 0)
+    (timed,) = sequences(tmp_path / "log.csv", fps=10)  # whose times hold the gaps
+    assert timed.notes == {}
