@@ -29,7 +29,11 @@ _MARK = re.compile(
 )
 EMPTY = "rows with nothing between their delimiters dropped"
 BLOCKS = "texts whose rows stand in blocks between empty lines, each read as one cloud"
+COUNTED = (
+    "texts whose column {0!r} counts up, as numbers of frames do; if each text is a recording, give --frame-column {0}"
+)
 _TELLING = 10  # rows that tell what columns without names hold
+_COUNTING = 256  # rows in which a column counts frames: scans sorted by ring have more points in each
 _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
     (".pts", 4): "x y z intensity",
     (".pts", 6): "x y z red green blue",
@@ -50,7 +54,10 @@ def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
         table = replace(table, names=tuple(names.split()))
     refuse_frames(table)
     _refuse_marked_frames(table)
-    return _counted(cloud_of_table(table, keep), table)
+    cloud = cloud_of_table(table, keep)
+    counting = _counting_column(table, cloud.unread)
+    cloud = replace(cloud, dropped=cloud.dropped | {COUNTED.format(counting): 1}) if counting else cloud
+    return _counted(cloud, table)
 
 
 def read_vertices(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -160,6 +167,22 @@ def _refuse_marked_frames(table: TextTable) -> None:
             f"{table.path}: comments such as {marks[0]!r:.60} divide its rows into frames; save each as its own file, or"
             " write the number into a column called frame"
         )
+
+
+def _counting_column(table: TextTable, unread: Sequence[str]) -> str:
+    """Returns the first column of those that were not read whose whole numbers go up one by one, some for several rows: it may
+    number frames in a word that isn't known. "" without one.
+    """
+    rows = [table.cells(line) for _, line in table.first_rows(_COUNTING)] if table.names else []
+    for name in unread if len(rows) > 2 else ():
+        cells = [row[table.names.index(name)].removesuffix(".0") for row in rows if len(row) == table.width]
+        if not all(cell.isascii() and cell.isdecimal() for cell in cells):
+            continue
+        steps = np.diff(np.array(cells, np.float64))
+        ones = np.count_nonzero(steps == 1)
+        if (steps >= 0).all() and ones > 1 and 2 * ones > np.count_nonzero(steps) and (steps == 0).any():
+            return name
+    return ""
 
 
 def refuse_frames(table: TextTable) -> None:

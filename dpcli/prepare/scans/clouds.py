@@ -134,6 +134,12 @@ class CloudFolders(OwnScans):
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"
         if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
+        labels = [item.label for item in items]
+        if self.label_from_folder and 1 < len(labels) == len(set(labels)) and frames > len(items):
+            lines.append(
+                "each class has one sequence only, whose frames are the files of its folder; if each file is a recording of its own,"
+                " put it into a folder of its own (CLASS/SEQUENCE/frames), or give --frame-column where it is a table of frames"
+            )
         lines += about_series([(item.name, item.extra["series"]) for item in items])
         return lines + (self._table.unnamed(items) if self._table else [])
 

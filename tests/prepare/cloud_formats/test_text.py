@@ -15,7 +15,7 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, EMPTY, read_text
+from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, COUNTED, EMPTY, read_text
 from dpcli.prepare.cloud_formats.text_numbers import CUT
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.reader import Item
@@ -251,6 +251,22 @@ def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
     with pytest.raises(DataError, match="a.csv: column t: float32, .* would round its values by up to 0.1;"):
         assemble(item, clouds[:1], Lengths())
     assert assemble(item, clouds[1:], Lengths()).sequence.extra["field_t"][0] == 5
+
+
+@quick
+@given(st.lists(st.integers(1, 5), min_size=3, max_size=8), st.integers(0, 9), st.sampled_from(["Bild", "fr", "n"]))
+def test_a_column_that_counts_frames_by_an_unknown_name_is_told(tmp_path, points, first, name):
+    numbers = [first + frame for frame, count in enumerate(points) for _ in range(count)]
+    rows = "".join(f"{number},{k},2.5,3\n" for k, number in enumerate(numbers))
+    told = {COUNTED.format(name): 1} if max(points) > 1 else {}  # else it may number the points
+    assert read(tmp_path / "a.csv", f"{name},x,y,z\n{rows}").dropped == told
+    assert read(tmp_path / "a.csv", f"{name},x,y,z\n{rows.replace(',', ';')}".replace(",", ";")).dropped == told
+
+
+@pytest.mark.parametrize("values", [(0, 0, 0, 0), (0, 2, 2, 4), (1, 2, 1, 2), (0, 1, 2, 3), (0.5, 1, 1, 2)])
+def test_columns_of_points_count_no_frames(tmp_path, values):
+    rows = "".join(f"{value},{k},2,3\n" for k, value in enumerate(values))
+    assert read(tmp_path / "a.csv", f"ring,x,y,z\n{rows}").dropped == {}
 
 
 def test_comments_and_empty_lines_between_rows(tmp_path):

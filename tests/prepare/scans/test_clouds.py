@@ -418,3 +418,13 @@ def test_angles_instead_of_lengths_are_told(tmp_path, header, told):
     (tmp_path / "0.csv").write_text(f"{header}\n1,2,3\n")
     with pytest.raises(DataError, match=told):
         read_cloud(tmp_path / "0.csv")
+
+
+def test_classes_of_one_sequence_each_are_told(tmp_path):
+    for label in ("wave", "bow"):
+        for name in ("a", "b"):
+            save(tmp_path / "flat" / label / f"{name}.csv")
+            save(tmp_path / "deep" / label / name / "0.csv")
+    for folder, told in (("flat", True), ("deep", False)):
+        reader = CloudFolders(tmp_path / folder, label_from_folder=True)
+        assert any("each class has one sequence only" in line for line in reader.summary(reader.items())) == told
