@@ -33,6 +33,7 @@ _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
+    " .jsonl .ndjson"
     " .c3d .bvh .asf .amc .skeleton"
     " .bag .mcap .db3 .active .bz2 .xz .zst .tar .tgz".split()
 )
@@ -40,6 +41,7 @@ _MARKERS = ".trc"  # tables of markers, which are read only where that is asked 
 _NOTES = (".json", ".yaml", ".yml", ".xml", ".toml")  # that may tell poses, times or labels
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
 _TABLE = "write a table with a row for each frame and columns such as hip_x, hip_y, hip_z, and give --track columns"
+_LINES = "write a table with a row for each point and columns frame, x, y and z"
 _ANIMATED = "save their frames as .obj with the same vertices, or export glTF 2.0, which `dpc prepare animation` reads"
 _ADVICE = {
     **dict.fromkeys((".gz", ".zip", ".7z", ".rar", ".bz2", ".xz", ".zst", ".tar", ".tgz"), "unpack them"),
@@ -52,7 +54,9 @@ _ADVICE = {
     _MARKERS: "give --track columns",
     ".c3d": "export them as .trc or .csv, and give --track columns",
     **dict.fromkeys((".bvh", ".asf", ".amc"), f"they hold angles of joints: compute where these are, and {_TABLE}"),
-    **dict.fromkeys((".skeleton", ".json"), f"if they hold joints, {_TABLE}"),
+    **dict.fromkeys((".jsonl", ".ndjson"), _LINES),
+    ".json": f"if they hold joints, {_TABLE}; if points, {_LINES}",
+    ".skeleton": f"if they hold joints, {_TABLE}",
     **dict.fromkeys((".abc", ".usd", ".usda", ".usdc", ".usdz", ".blend", ".fbx"), _ANIMATED),
     **dict.fromkeys(
         (".glb", ".gltf"), "where one is animated, `dpc prepare animation` reads it; else save their points as .ply"

@@ -161,9 +161,10 @@ def test_formats_of_motion_capture_are_told_what_to_do(tmp_path: Path) -> None:
         "walk.c3d": "export them as .trc or .csv, and give --track columns",
         "walk.bvh": "they hold angles of joints: compute where these are",
         "000_keypoints.json": "if they hold joints, write a table with a row for each frame",
+        "scans.jsonl": "write a table with a row for each point and columns frame, x, y and z",
         "walk.trc": "give --track columns",
     }.items():
-        folder = tmp_path / name[-3:]
+        folder = tmp_path / name.replace(".", "_")
         folder.mkdir()
         (folder / name).write_text("x\n")
         for raw in (folder, folder / name)[: 1 if name == "walk.trc" else 2]:
