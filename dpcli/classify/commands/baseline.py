@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.descriptors import descriptors
+from dpcli.classify.data.validation_split import about_other_splits
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
@@ -69,6 +70,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         values = descriptors(reader, known.tolist(), columns)
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
+        _tell_left_out(reader, known)
         for learned, judged in rounds:
             scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)
         judged = np.flatnonzero(np.isfinite(scores[:, 0]))
@@ -94,7 +96,7 @@ def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iter
 
     splits = np.array(reader.splits)[known]
     if "test" in splits:
-        learned = np.flatnonzero((splits != "test") & (splits != "validation"))
+        learned = np.flatnonzero(splits == "train" if "train" in splits else ~np.isin(splits, ("test", "validation")))
         if not len(learned):
             raise DataError(
                 f"{reader.path}: all labeled videos are of the split test; a forest needs some to learn from"
@@ -111,6 +113,20 @@ def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iter
     if fewest < _STEADY:
         log.warn(f"{reader.path}: a class has only {fewest} videos; the accuracy is unreliable")
     yield from StratifiedKFold(min(_FOLDS, fewest), shuffle=True, random_state=0).split(known, labels)
+
+
+def _tell_left_out(reader: CloudsReader, known: np.ndarray) -> None:
+    """Counts the videos that the forest neither learns from nor is judged on, but for those of the split `validation`, with a
+    message."""
+    unlabeled = [reader.names[i] for i in np.setdiff1d(np.arange(len(reader)), known)]
+    if unlabeled:
+        log.warn(
+            f"{reader.path}: {counted(len(unlabeled), 'video')} without a label left out: {first_names(unlabeled)}"
+        )
+    splits = {reader.splits[i] for i in known}
+    others = about_other_splits(reader) if {"train", "test"} <= splits else ""
+    if others:
+        log.warn(f"{reader.path}: {others}")
 
 
 def _tell_unknown_classes(

@@ -20,6 +20,7 @@ from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     about_absent_classes,
     about_classes,
+    about_other_splits,
     about_people,
     carve_validation,
     class_table,
@@ -251,6 +252,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
         )
     _check_labels(reader, training, validation, rule)
     _tell_unlabeled(reader, ("train", "validation") if rule == "split" else ("train",))
+    if others := about_other_splits(reader):
+        log.warn(f"{path}: {others}")
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
     left_out: dict[str, str] = {}

@@ -192,6 +192,17 @@ def about_absent_classes(reader: CloudsReader, training: list[int], validation: 
     )
 
 
+def about_other_splits(reader: CloudsReader) -> str:
+    """Returns which videos neither train nor judge, as they are of no split or of one that isn't known, "" where there are none."""
+    others = {name: None for name in reader.splits if name not in ("train", "validation", "test")}
+    told = []
+    for other in others:
+        names = [name for name, split in zip(reader.names, reader.splits) if split == other]
+        whose = f"of the split {other!r}" if other else "of no split"
+        told.append(f"{counted(len(names), 'video')} {whose} left out: {first_names(names)}")
+    return "; ".join(told)
+
+
 def about_people(reader: CloudsReader, training: list[int], validation: list[int]) -> str:
     """Returns a caveat about the validation accuracy for the user, "" where no person is in both training and validation."""
     learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))

@@ -89,6 +89,26 @@ def test_people_of_both_splits_are_told(tmp_path):
     assert "people never seen come out lower" in command.baseline(str(tmp_path / "b.h5")).seen
 
 
+def test_videos_of_other_splits_are_not_learned_from_and_told(tmp_path, capsys):
+    data, output = write(tmp_path / "a.h5"), tmp_path / "s.h5"
+    with CloudsReader(data) as reader, CloudsWriter(tmp_path / "b.h5", class_names=UP) as writer:
+        for index in range(len(reader)):
+            writer.write(reader.read(index))
+        for split, label in (("dev", 0), ("", 1), ("train", -1)):
+            extra = reader.read(0)
+            extra.name, extra.split, extra.label = f"{split or 'none'} one", split, label
+            writer.write(extra)
+    scores = []
+    for name in ("a", "b"):
+        result = command.baseline(str(tmp_path / f"{name}.h5"), output=str(output), force=True)
+        assert (result.learned, result.judged) == (18, 6)
+        scores.append(ScoresReader(output).scores)
+    assert np.array_equal(*scores)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "1 video of the split 'dev' left out: dev one; 1 video of no split left out: none one" in said
+    assert "1 video without a label left out: train one" in said
+
+
 def test_judged_videos_of_a_class_that_nothing_was_learned_of_are_told(tmp_path, capsys):
     write(tmp_path / "a.h5")
     with CloudsReader(tmp_path / "a.h5") as reader, CloudsWriter(tmp_path / "b.h5", class_names=UP) as writer:

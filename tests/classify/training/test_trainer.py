@@ -428,10 +428,12 @@ def test_what_can_not_be_judged_or_told_apart_is_said(tmp_path, make_sequence, c
     assert dpc(*words, uneven, "-o", tmp_path / "c", "--validation", "subject") == 2
     assert "uneven.h5 doesn't say who is seen" in capfd.readouterr().err
     with CloudsWriter(tmp_path / "held.h5", class_names=("up", "down")) as writer:
-        for i, label in enumerate((0, 1, 0, -1, -1)):
-            writer.write(make_sequence(f"{i}", label=label, frames=4, split="train" if i < 2 else "validation"))
+        for i, (label, split) in enumerate(zip((0, 1, 0, -1, -1, 0), ("train",) * 2 + ("validation",) * 3 + ("dev",))):
+            writer.write(make_sequence(f"{i}", label=label, frames=4, split=split))
     assert dpc(*words, tmp_path / "held.h5", "-o", tmp_path / "e", "--validation", "split") == 0
-    assert "2 videos of the split 'validation' without a label, left out: 3, 4" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "2 videos of the split 'validation' without a label, left out: 3, 4" in said
+    assert "1 video of the split 'dev' left out: 5" in said
     twice = write("twice", [0, 0, 1, 2], classes=("up", "down", "up"))
     assert dpc(*words, twice, "-o", tmp_path / "d", "--validation", "none") == 3
     assert "class names repeat, such as 'up'" in capfd.readouterr().err and not (tmp_path / "d").exists()
