@@ -14,6 +14,7 @@ CROWDED = (
     "sequences in which many points of a frame lie at one and the same place; returns that met nothing, or padding?"
 )
 IMPOSSIBLE = "points at impossible places (such as 1e30 or -9999 on all axes) dropped"
+LONE = "frames whose only point lies at {}; if that stands for nothing seen, leave those rows out"
 _STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -32768.0, -(2.0**31), 2.0**31 - 1)
 # on all three axes
 _ROUNDED = 1e-8  # what remains of 0 where points were turned, or the smallest number of a type
@@ -24,8 +25,9 @@ _FARTHEST = 1e10  # no map has such coordinates, in any unit
 def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
     """Removes from the frames of one sequence, in place, what is no measurement. Returns how many points, by reason.
 
-    One point at the origin in a frame may be a corner of a modeled shape and stays, unless some frame has more: two
-    points of one measurement are never at the same place.
+    One point at the origin in a frame may be a corner of a modeled shape and stays, unless some frame has more, as two points
+    of one measurement are never at the same place, or has nothing else while others have several points: radars log a row of
+    zeros for a frame in which they saw nothing. Other lone points with equal coordinates, such as -1, are counted only.
     """
     found: Counter[str] = Counter()
     origins = []
@@ -37,7 +39,11 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
         found[IMPOSSIBLE] += _drop(cloud, _impossible(cloud.points, float(np.abs(ends).max())))
         zero = np.abs(cloud.points[:, 0]) < _ROUNDED
         origins.append(zero & (np.abs(cloud.points[:, 1:]) < _ROUNDED).all(1) if zero.any() else zero)
-    if any(np.count_nonzero(own) > 1 for own in origins) or _far_from_origin(clouds, origins):
+    several = any(len(cloud.points) > 1 for cloud in clouds)
+    alone = several and any(own.all() for own in origins if len(own))
+    if several:
+        found |= _lone(clouds)
+    if alone or any(np.count_nonzero(own) > 1 for own in origins) or _far_from_origin(clouds, origins):
         found[AT_ORIGIN] = sum(_drop(cloud, own) for cloud, own in zip(clouds, origins))
     return {what: count for what, count in found.items() if count}
 
@@ -79,6 +85,15 @@ def _impossible(points: np.ndarray, farthest: float) -> np.ndarray:
     if farthest > _FARTHEST:
         return stand_in | (np.abs(points) > _FARTHEST).any(1)
     return stand_in
+
+
+def _lone(clouds: Sequence[Cloud]) -> Counter[str]:
+    """Returns how many frames hold one point alone, with the same value on all axes, by that place; none of a place that one
+    frame alone has.
+    """
+    places = (tuple(map(float, cloud.points[0])) for cloud in clouds if len(cloud.points) == 1)
+    counts = Counter(place for place in places if place[0] and len(set(place)) == 1)
+    return Counter({LONE.format("({:g}, {:g}, {:g})".format(*place)): n for place, n in counts.items() if n > 1})
 
 
 def _far_from_origin(clouds: Sequence[Cloud], origins: Sequence[np.ndarray]) -> bool:

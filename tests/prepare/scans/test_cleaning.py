@@ -13,7 +13,7 @@ from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item
 from dpcli.prepare.scans.assembling import COARSE, Lengths, assemble
-from dpcli.prepare.scans.cleaning import AT_ORIGIN, CROWDED, IMPOSSIBLE, NOT_FINITE, clean
+from dpcli.prepare.scans.cleaning import AT_ORIGIN, CROWDED, IMPOSSIBLE, LONE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.runtime.machines.shards import Shard
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -68,6 +68,15 @@ def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
     assert clean([Cloud(corner), Cloud(corner)]) == {}
     assert clean([Cloud(corner), Cloud(np.vstack([corner, np.zeros((1, 3))]))]) == {AT_ORIGIN: 3}
     assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + 448_000]))]) == {AT_ORIGIN: 1}
+
+
+def test_frames_of_one_row_that_stands_for_nothing():
+    nothing = np.zeros((1, 3))
+    assert clean([Cloud(POINTS), Cloud(nothing), Cloud(nothing)]) == {AT_ORIGIN: 2}
+    assert clean([Cloud(nothing), Cloud(POINTS[:1])]) == {}  # one point is followed
+    seen = [Cloud(POINTS), Cloud(nothing - 1), Cloud(nothing - 1), Cloud(nothing - 5), Cloud(POINTS[:1])]
+    assert clean(seen) == {LONE.format("(-1, -1, -1)"): 2} and [len(one.points) for one in seen] == [20, 1, 1, 1, 1]
+    assert clean([Cloud(POINTS[:1]), Cloud(nothing - 1), Cloud(nothing - 1)]) == {}
 
 
 def test_ordinary_points_on_diagonals_and_axes_stay():
