@@ -83,11 +83,11 @@ def _check_names(
 def _check_classes(scores: ScoresReader, truth: str | Path, class_names: Sequence[str]) -> None:
     if not class_names or list(class_names) == list(scores.class_names):
         return
+    advice = f"; {REORDER}" if {*class_names} <= {*scores.class_names} else ""
     if len(class_names) != len(scores.class_names):
         raise DataError(
-            f"{truth}: {counted(len(class_names), 'class')}, but {scores.path} scores {len(scores.class_names)}"
+            f"{truth}: {counted(len(class_names), 'class')}, but {scores.path} scores {len(scores.class_names)}{advice}"
         )
     pairs = enumerate(zip(class_names, scores.class_names, strict=True))
     label, (ours, theirs) = next(pair for pair in pairs if pair[1][0] != pair[1][1])
-    advice = f"; {REORDER}" if {*class_names} == {*scores.class_names} else ""
     raise DataError(f"{truth}: class {label} is {ours!r}, in {scores.path} it is {theirs!r}{advice}")

@@ -145,6 +145,8 @@ def test_truth_with_other_classes_names_the_first(scores: Path, tmp_path: Path) 
         evaluate_classification(scores, write_truth(tmp_path / "t.h5", labels, ("wave", "pull", "push")))
     with pytest.raises(DataError, match="4 classes, but .* scores 3"):
         evaluate_classification(scores, write_truth(tmp_path / "u.h5", labels, (*NAMES, "more")))
+    with pytest.raises(DataError, match="2 classes, but .* scores 3; `dpc prepare merge"):
+        evaluate_classification(scores, write_truth(tmp_path / "w.h5", labels, NAMES[1:]))
     with pytest.raises(DataError, match="label 7 of 'b'"):
         evaluate_classification(scores, write_truth(tmp_path / "v.h5", {**labels, "b": 7}, ()))
 
