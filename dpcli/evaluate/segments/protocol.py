@@ -73,7 +73,10 @@ def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: 
         raise DataError(f"{truth}: no recording of this name: {list_names(unknown)}; it has {list_names(missing)}")
     if (unknown or missing) and not intersect:
         side, lacking = ("the truth lacks", unknown) if unknown else ("the prediction lacks", missing)
-        raise DataError(f"{truth}: {side} {list_names(lacking)}; --intersect evaluates the recordings that both have")
+        empty = "where nothing happens in one, a row with an empty class says so; " if unknown else ""
+        raise DataError(
+            f"{truth}: {side} {list_names(lacking)}; {empty}--intersect evaluates the recordings that both have"
+        )
     entries = [LeftOut("the truth doesn't have", unknown), LeftOut("not predicted", missing)]
     return [entry for entry in entries if entry.names]
 

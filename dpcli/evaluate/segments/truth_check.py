@@ -55,7 +55,10 @@ def doubts_of_frames(predicted: Segments, true: Segments, names: Sequence[str]) 
     ends = [(name, true.recordings[name][-1].end, predicted.recordings[name][-1].end) for name in names]
     late = [f"{name} (frame {end}, predicted to {own})" for name, end, own in ends if end > own]
     if late:
-        yield f"names frames behind the last predicted one in {list_names(late)}; frames of another rate, or counted from 1?"
+        yield (
+            f"names frames behind the last predicted one in {list_names(late)}; frames of another rate, counted from 1, or those"
+            " too that `dpc prepare` left out since they showed nothing?"
+        )
     elif ends and all(end <= _SHORT * own for _, end, own in ends):
         name, end, own = ends[0]
         yield f"ends at frame {end} of {name}, predicted to {own}, and early in all; are these frames, not seconds?"

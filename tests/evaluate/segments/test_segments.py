@@ -162,3 +162,13 @@ def test_what_is_no_table_is_named(tmp_path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"t\.json"):
         read_segments(path)
+
+
+def test_a_recording_in_which_nothing_happens_has_a_row_without_a_class(tmp_path, capsys):
+    guess = table(tmp_path / "p.csv", "a,0,3,wave\nb,0,4,\n")
+    with pytest.raises(SystemExit):
+        main(["evaluate", "segments", guess, "--truth", table(tmp_path / "t.csv", "a,0,3,wave\n")])
+    assert "the truth lacks 'b'; where nothing happens in one, a row with an empty class" in capsys.readouterr().err
+    truth = table(tmp_path / "t.csv", "a,0,3,wave\nb,0,4,\n")
+    found = json.loads(run(guess, "--truth", truth, "--json").stdout)
+    assert found["metrics"]["frame_accuracy"] == 1 and found["denominators"]["recordings"] == 2
