@@ -129,7 +129,11 @@ def places_of(path: Path, written: Iterable[str], names: Iterable[str]) -> dict[
     places = {one: found.get(_plain(one)) or found.get(_stem(one)) for one in written}
     strangers = sorted(one for one, name in places.items() if not name)
     if strangers:
-        raise DataError(f"{path}: names {strangers[0]!r}, which is not among the samples ({', '.join(known[:3])}, ...)")
+        listed, verb = first_names([repr(one) for one in strangers], 3), "is" if len(strangers) == 1 else "are"
+        raise DataError(
+            f"{path}: names {listed}, which {verb} not among the samples ({', '.join(known[:3])}, ...); spell"
+            f" {'it' if verb == 'is' else 'them'} as these, or take {'its line' if verb == 'is' else 'their lines'} out"
+        )
     twice = [name for name, count in Counter(places.values()).items() if count > 1]
     if twice:
         raise DataError(f"{path}: names {twice[0]!r} twice, with and without its suffix")

@@ -97,6 +97,10 @@ def test_by_list(whole, tmp_path):
     for text, message in (
         ("s03,a\ns03,b\n", "list.csv:2: 's03' appears twice"),
         ("s99,a\n", "names 's99', which is not among the samples"),
+        (
+            "s95,a\ns96,a\ns97,a\ns98,a\n",
+            "names 's95', 's96', 's97' and 1 more, which are not among .* take their lines out",
+        ),
         ("s03\n", "list.csv:1: 's03'; expected name,split"),
     ):
         listed.write_text(text)
