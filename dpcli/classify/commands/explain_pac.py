@@ -157,7 +157,7 @@ def chosen_samples(reader: CloudsReader, wanted: str, pool: Sequence[int]) -> li
     each, and so on. Raises DataError for a name that isn't there, UsageError for the number 0.
     """
     if not _is_count(reader, wanted):
-        names = [name for name in wanted.split(",") if name]
+        names = [wanted] if wanted in reader.names else [name for name in wanted.split(",") if name]
         missing = sorted(set(names) - set(reader.names))
         if missing or not names:
             raise DataError(

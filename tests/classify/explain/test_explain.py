@@ -341,6 +341,14 @@ def test_rescaling_and_wrong_questions(data):
         chosen_samples(reader, "0", range(6))
 
 
+def test_a_sample_s_name_may_hold_a_comma(tmp_path):
+    with CloudsWriter(tmp_path / "a.h5") as writer:
+        for name in ("late, tired", "late"):
+            writer.write(CloudSequence.from_frames(name, [np.ones((4, 3))]))
+    reader = CloudsReader(tmp_path / "a.h5")
+    assert [chosen_samples(reader, wanted, range(2)) for wanted in ("late, tired", "late", "1")] == [[0], [1], [0]]
+
+
 def test_fused_is_the_mean_and_the_target_may_be_predicted_or_the_label(model, data):
     source = ClipSource(CloudsReader(data), [1], model.config)
     clip = source.clips(1)[0]
