@@ -15,7 +15,7 @@ from dpcli.prepare.name_tables import places_of, read_rows, warn_of_splits
 from dpcli.prepare.reader import Item, split_called
 from dpcli.runtime.progress import log
 
-_WHOLE = re.compile(r"^(-?\d+)\.0+$")  # as programs write a column of numbers that has a gap
+_WHOLE = re.compile(r"^(-?\d+)[.,]0+$")  # as programs write a column of numbers that has a gap
 _NUMBERED = re.compile(r"([^\W\d]+[ _.-]?)(\d{1,9})")  # such as s01
 _BETWEEN = re.compile(r"[\s_-]+")
 

@@ -82,6 +82,13 @@ def test_subjects_are_the_numbers_in_their_names(tmp_path, spelled):
     assert [row.subject for row in table(tmp_path, "name,label,subject\n" + rows).rows.values()] == [-1, 3, 12]
 
 
+@pytest.mark.parametrize("comma", [".", ","])
+def test_whole_numbers_may_be_written_with_a_fraction_of_0(tmp_path, comma):
+    rows = "".join(f"v{k};{k}{comma}0;{k + 7}{comma}00\n" for k in (0, 2, 11))
+    read = table(tmp_path, "name;label;subject\n" + rows)
+    assert [(row.label, row.subject) for row in read.rows.values()] == [(0, 7), (2, 9), (11, 18)]
+
+
 @pytest.mark.parametrize("subjects", [("m1", "f1"), ("anna", "ben"), ("s1", "2"), ("1.5", "2.5")])
 def test_subjects_whose_numbers_may_be_of_two_people_are_refused(tmp_path, subjects):
     with pytest.raises(DataError, match="expected a whole number"):
