@@ -99,7 +99,20 @@ class CloudFolders(OwnScans):
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, series.folder, extra={**told, "series": series}))
-        return self._table.apply(items) if self._table else items
+        return self._with_labels(items) if self._table else items
+
+    def _with_labels(self, items: list[Item]) -> list[Item]:
+        """Returns items with what the table says of them. Raises DataError when it names a stranger, and says so where the names
+        are those of frames.
+        """
+        try:
+            return self._table.apply(items)
+        except DataError as error:
+            frames = {Path(name).stem for one in self._series for name in one.names}
+            if frames & {Path(name).stem for name in self._table.rows}:
+                advice = "put those of each into a folder of its own, or, where each is a table of many frames, give --frame-column"
+                raise DataError(f"{error}. Files of one folder are the frames of one sample: {advice}") from None
+            raise
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""

@@ -428,3 +428,13 @@ def test_classes_of_one_sequence_each_are_told(tmp_path):
     for folder, told in (("flat", True), ("deep", False)):
         reader = CloudFolders(tmp_path / folder, label_from_folder=True)
         assert any("each class has one sequence only" in line for line in reader.summary(reader.items())) == told
+
+
+def test_a_table_that_names_frames_is_told_what_a_sample_is(tmp_path):
+    for name in ("a", "b"):
+        save(tmp_path / "in" / f"{name}.csv")
+    for text, told in (("a.csv,wave\nb,bow\n", True), ("c,wave\n", False)):
+        (tmp_path / "labels.csv").write_text("name,label\n" + text)
+        with pytest.raises(DataError, match="not among the samples") as raised:
+            CloudFolders(tmp_path / "in", labels=tmp_path / "labels.csv").items()
+        assert ("the frames of one sample" in str(raised.value) and "--frame-column" in str(raised.value)) == told
