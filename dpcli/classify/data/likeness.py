@@ -14,10 +14,13 @@ from dpcli.classify.network.model_file import SHIPPED, ModelInfo, find_model
 from dpcli.counted import counted
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
+from dpcli.store.schema import kept_name
 
 NOTE = "learned_from"  # in a model's notes: `like`
 _VIDEOS, _FRAMES = 50, 8  # looked at, evenly over a file and over a video
 _OTHER_UNIT, _OTHER_SENSOR = 3.0, 10.0  # times as large, times as many points
+_RESTING = 10.0  # times as little as in training that a column may vary: who moves little has low speeds
+_MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
 _SHIPPED = {"extent": 0.233, "frames": 76.0}  # MSR-Action3D's training videos: the shipped networks' files don't say it
 _ROUNDED = 0.05  # of the extent: coarser steps show
@@ -78,6 +81,31 @@ def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
             f" from ({reader.names[long[0]]}: {reader.frame_counts[long[0]]} frames after {longest:g}), and each gets one label:"
             " --segments cuts recordings of several actions"
         )
+
+
+def tell_columns(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
+    """Warns where the columns that a network reads lack most of their values, or spread much more or less than in its training."""
+    scales, some = info.config.scales, list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]
+    for name, spread in zip(info.config.columns, scales[2::2]):
+        field = kept_name(name)
+        values = np.concatenate([reader.read(i, fields=(field,)).extra[field] for i in some])
+        known = values[np.isfinite(values)]
+        if not len(values):
+            continue
+        if len(known) <= _MISSING * len(values):
+            log.warn(
+                f"{reader.path}: {len(values) - len(known)} of {counted(len(values), 'value')} of column {name} are missing, which"
+                f" {model} reads of every point and takes for average{_EXPECT}"
+            )
+            continue
+        low, high = np.quantile(known, [0.1, 0.9])
+        own = float(high - low) / 2
+        if not spread / _RESTING < own < spread * _OTHER_UNIT:
+            log.warn(
+                f"{reader.path}: four fifths of column {name} lie within {2 * own:.3g}, within {2 * spread:.3g} in what {model} learned"
+                " from: is its unit another one, or was nothing measured? The scores would be meaningless; bring the raw column into"
+                " the unit of the training, and prepare it again"
+            )
 
 
 def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str | Path) -> None:

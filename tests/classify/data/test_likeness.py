@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpcli.classify.commands.train import _tell_unlabeled
-from dpcli.classify.data.likeness import NOTE, file_like, like, tell_long, tell_rounded, tell_unlike
+from dpcli.classify.data.likeness import NOTE, file_like, like, tell_columns, tell_long, tell_rounded, tell_unlike
 from dpcli.classify.data.videos import select_videos
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import SHIPPED, ModelInfo
@@ -74,3 +74,28 @@ def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):
     assert "1 of 2 videos over 5 times as long as any" in capsys.readouterr().err
     _tell_unlabeled(reader, ("train",))
     assert "1 video of the split 'train' without a label, left out: long" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"),
+    [
+        (1.0, ""),
+        (2.0, ""),
+        (0.2, ""),
+        (3.6, "four fifths of column v"),  # km/h
+        (100.0, "is its unit another one"),
+        (0.0, "was nothing measured"),
+        (np.nan, "600 of 600 values of column v are missing"),
+    ],
+)
+def test_columns_in_another_unit_or_without_values_are_told(speed, said, capsys, tmp_path):
+    rng = np.random.default_rng(0)
+    with CloudsWriter(tmp_path / "c.h5", fields=["field_v"]) as writer:
+        for name in ("a", "b"):
+            sequence = CloudSequence.from_frames(name, [one[:100] for one in body()[:3]])
+            sequence.extra = {"field_v": (speed * rng.uniform(-1, 1, 300)).astype(np.float32)}
+            writer.write(sequence)
+    config = KinetConfig(backbone="slots", widths=((64, 64), (96,)), columns=("v",), scales=(0.3, 0.0, 0.8))
+    tell_columns(CloudsReader(tmp_path / "c.h5"), [0, 1], ModelInfo(config, ["a"], "slots"), "runs/own")
+    err = " ".join(capsys.readouterr().err.split())
+    assert said in err and bool(said) == bool(err)
