@@ -15,7 +15,7 @@ import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
-from dpcli.classify.data.likeness import like, tell_unlike
+from dpcli.classify.data.likeness import like, tell_unlike, tell_values
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames
 from dpcli.classify.stream.read_ahead import ReadAhead
@@ -90,9 +90,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
         watch = _IrregularFrames(
-            info.timing == "slots",
-            predictor.window.size,
-            lambda theirs: tell_unlike(task.source, theirs, info, task.model),
+            info.timing == "slots", predictor.window.size, lambda first: _tell_unlike(task, info, first)
         )
         problem = _follow(predictor, frames, new_listener(speaker), stop, watch)
         if not predictor.clips:
@@ -192,6 +190,14 @@ def _follow(
     return problem
 
 
+def _tell_unlike(task: ModelTask, info: ModelInfo, first: list[np.ndarray]) -> None:
+    """Warns where the first frames f32 (P,3+F) of a stream are unlike what the model learned from, their columns too."""
+    tell_unlike(task.source, like([points[:, :3] for points in first]), info, task.model)
+    for place, name in enumerate(info.config.columns, start=3):
+        values = np.concatenate([points[:, place] for points in first])
+        tell_values(task.source, name, values, info, task.model, resting=True)
+
+
 class _IrregularFrames:
     """Warns of the first empty, sparse or late frame at once, and counts them at the end.
 
@@ -200,7 +206,7 @@ class _IrregularFrames:
     """
 
     def __init__(
-        self, few: bool = False, window: int = 0, compare: Callable[[dict[str, float]], None] = lambda theirs: None
+        self, few: bool = False, window: int = 0, compare: Callable[[list[np.ndarray]], None] = lambda first: None
     ) -> None:
         self.empty = self.sparse = self.gaps = 0
         self._few, self._window, self._compare = few, window, compare
@@ -209,9 +215,9 @@ class _IrregularFrames:
     def see(self, number: int, points: np.ndarray, silent: float) -> None:
         """Looks at a frame, and at the seconds since the one before."""
         if number < self._window:
-            self._first.append(points[:, :3])
+            self._first.append(points)
             if number + 1 == self._window:
-                self._compare(like(self._first))
+                self._compare(self._first)
                 self._first = []
         if silent > _SILENT:
             if not self.gaps:
@@ -234,7 +240,7 @@ class _IrregularFrames:
     def sum_up(self) -> None:
         """Logs how many irregular frames there were, where there was more than one."""
         if self._first:  # fewer than a window
-            self._compare(like(self._first))
+            self._compare(self._first)
         counts = {
             "without points": self.empty,
             f"of fewer than {_SPARSE} points": self.sparse,

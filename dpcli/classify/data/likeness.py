@@ -85,27 +85,36 @@ def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
 
 def tell_columns(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
     """Warns where the columns that a network reads lack most of their values, or spread much more or less than in its training."""
-    scales, some = info.config.scales, list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]
-    for name, spread in zip(info.config.columns, scales[2::2]):
+    some = list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]
+    for name in info.config.columns:
         field = kept_name(name)
         values = np.concatenate([reader.read(i, fields=(field,)).extra[field] for i in some])
-        known = values[np.isfinite(values)]
-        if not len(values):
-            continue
-        if len(known) <= _MISSING * len(values):
-            log.warn(
-                f"{reader.path}: {len(values) - len(known)} of {counted(len(values), 'value')} of column {name} are missing, which"
-                f" {model} reads of every point and takes for average{_EXPECT}"
-            )
-            continue
-        low, high = np.quantile(known, [0.1, 0.9])
-        own = float(high - low) / 2
-        if not spread / _RESTING < own < spread * _OTHER_UNIT:
-            log.warn(
-                f"{reader.path}: four fifths of column {name} lie within {2 * own:.3g}, within {2 * spread:.3g} in what {model} learned"
-                " from: is its unit another one, or was nothing measured? The scores would be meaningless; bring the raw column into"
-                " the unit of the training, and prepare it again"
-            )
+        tell_values(str(reader.path), name, values, info, model)
+
+
+def tell_values(
+    what: str, name: str, values: np.ndarray, info: ModelInfo, model: str | Path, resting: bool = False
+) -> None:
+    """Warns where the values (N) of a column lack, or spread unlike those that a network learned from. resting: they are of so
+    short a time that nobody may have moved."""
+    known = values[np.isfinite(values)]
+    if not len(values):
+        return
+    if len(known) <= _MISSING * len(values):
+        log.warn(
+            f"{what}: {len(values) - len(known)} of {counted(len(values), 'value')} of column {name} are missing, which {model}"
+            f" reads of every point and takes for average{_EXPECT}"
+        )
+        return
+    spread = info.config.scales[2 + 2 * info.config.columns.index(name)]
+    low, high = np.quantile(known, [0.1, 0.9])
+    own = float(high - low) / 2
+    if own >= spread * _OTHER_UNIT or (own <= spread / _RESTING and not resting):
+        log.warn(
+            f"{what}: four fifths of column {name} lie within {2 * own:.3g}, within {2 * spread:.3g} in what {model} learned from: is"
+            " its unit another one, or was nothing measured? The scores would be meaningless; bring the raw column into the unit of"
+            " the training, and prepare it again"
+        )
 
 
 def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str | Path) -> None:

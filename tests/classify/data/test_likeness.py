@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from dpcli.classify.commands.stream import _tell_unlike
 from dpcli.classify.commands.train import _tell_unlabeled
-from dpcli.classify.data.likeness import NOTE, file_like, like, tell_columns, tell_long, tell_rounded, tell_unlike
+from dpcli.classify.data.likeness import (
+    NOTE,
+    file_like,
+    like,
+    tell_columns,
+    tell_long,
+    tell_rounded,
+    tell_unlike,
+    tell_values,
+)
 from dpcli.classify.data.videos import select_videos
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import SHIPPED, ModelInfo
@@ -99,3 +111,16 @@ def test_columns_in_another_unit_or_without_values_are_told(speed, said, capsys,
     tell_columns(CloudsReader(tmp_path / "c.h5"), [0, 1], ModelInfo(config, ["a"], "slots"), "runs/own")
     err = " ".join(capsys.readouterr().err.split())
     assert said in err and bool(said) == bool(err)
+
+
+@pytest.mark.parametrize(("speed", "told"), [(0.0, False), (1.0, False), (100.0, True), (np.nan, True)])
+def test_the_first_seconds_of_a_stream_may_show_nobody_who_moves(speed, told, capsys, tmp_path):
+    (tmp_path / "m.safetensors").touch()
+    config = KinetConfig(backbone="slots", widths=((64, 64), (96,)), columns=("v",), scales=(0.3, 0.0, 0.8))
+    first = [np.column_stack([one[:20], speed * one[:20, 0] * 5]) for one in body()] + [np.zeros((0, 4))]
+    _tell_unlike(
+        SimpleNamespace(source="x", model=tmp_path / "m.safetensors"), ModelInfo(config, ["a"], "slots"), first
+    )
+    assert ("column v" in capsys.readouterr().err) == told
+    tell_values("x", "v", np.zeros(0), ModelInfo(config, ["a"], "slots"), "runs/own")
+    assert not capsys.readouterr().err
