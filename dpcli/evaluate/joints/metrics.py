@@ -106,19 +106,23 @@ def _edges(joint: np.ndarray, name: dict[int, int]) -> dict[frozenset[int], int]
 
 
 def _compare(truth: np.ndarray, guess: np.ndarray, same_child: bool, found: JointStatistics) -> None:
-    """Adds the errors of one joint of the right type: axis and place in frame 0, value in all frames since frame 0."""
+    """Adds the errors of one joint of the right type: axis and place in frame 0, value in all frames after frame 0.
+
+    Values count from frame 0, where both are 0 by definition, so that frame says nothing of the error.
+    """
     first, second = truth[0, AXIS], guess[0, AXIS]
     cosine = float(np.clip(first @ second, -1, 1))
     angle = float(np.degrees(np.arccos(abs(cosine))))
     found.angles.append(angle)
     found.near += angle <= _NEAR
     sign = (1 if cosine >= 0 else -1) * (1 if same_child else -1)
-    apart = truth[:, VALUE] - truth[0, VALUE] - sign * (guess[:, VALUE] - guess[0, VALUE])
-    if truth[0, TYPE] == REVOLUTE:
+    apart = truth[1:, VALUE] - truth[0, VALUE] - sign * (guess[1:, VALUE] - guess[0, VALUE])
+    turns = truth[0, TYPE] == REVOLUTE
+    if turns:
         found.distances.append(line_distance(truth[0, POINT], first, guess[0, POINT], second))
-        found.turns.append(float(np.degrees(np.abs((apart + np.pi) % (2 * np.pi) - np.pi)).mean()))
-    else:
-        found.slides.append(float(np.abs(apart).mean()))
+    if len(apart):
+        errors = np.degrees(np.abs((apart + np.pi) % (2 * np.pi) - np.pi)) if turns else np.abs(apart)
+        (found.turns if turns else found.slides).append(float(errors.mean()))
 
 
 def line_distance(first: np.ndarray, direction: np.ndarray, second: np.ndarray, other: np.ndarray) -> float:

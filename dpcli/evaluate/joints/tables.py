@@ -24,7 +24,7 @@ _SHARES = ("type", "axis_within_5", "visible_type", "visible_axis_within_5", "ed
 _NOTE = (
     "Parts are matched over all frames at IoU 0.5. A joint that connects other parts, or none, has the wrong type and no "
     "axis within 5 degrees. Axis angle, axis position (the least distance between the two axes of a hinge) and value "
-    "(since frame 0, mean over the frames): of the joints of the right type, in the coordinates of frame 0. Visible: joints "
+    "(since frame 0, mean over the later frames): of the joints of the right type, in the coordinates of frame 0. Visible: joints "
     f"whose motion takes the child's points at least {VISIBLE:g} times the sampling distance, by the truth's poses."
 )
 

@@ -27,9 +27,11 @@ _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
 _NEAREST = 300.0  # meters from a sensor that are farther than any measures without measuring something before
 _COUNTED, _LOOKED_AT = 20.0, 1000  # meters from which on whole numbers alone are odd, and points that tell
 _DEGREES, _UPRIGHT = 0.01, 100.0  # sides as shares of how far away they lie; height as a multiple of them
-_COARSE = 0.01  # meters between neighboring float32 numbers, from which on a shape is lost
+_COARSE = 0.01  # meters, or share of the extent, between neighboring float32 numbers, from which on a shape is lost
+_FINE = 1e-4  # share of the extent between neighboring float32 numbers, up to which nothing is lost
 COARSE = (
-    "sequences whose files hold map coordinates in float32, which rounds them to 1 cm or more; write them in double"
+    "sequences whose files hold map coordinates in float32, which rounds them to 1 cm, or 1 % of their extent, or more;"
+    " write them in double"
 )
 UNREAD_COLORS = "frames with colors, which are not read, as the first of all has none"
 _LISTED = 8
@@ -140,8 +142,8 @@ def assemble(
     points, shift = _joined(frames, divisor, ends)
     if shift is not None:
         notes[SHIFTED] = 1
+    notes |= _rounded(frames, each, divisor, _COARSE if lengths.unit == "m" else np.inf)
     if lengths.unit == "m":
-        notes |= _rounded(frames, each, divisor)
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
     notes |= _further([clouds[t] for t in kept], item.extra["unread"]) if "unread" in item.extra else {}
     extra = {
@@ -190,9 +192,12 @@ def _joined(
     """Returns the points of all frames f32 (P,3), divided, less the corner of the first frame, and that corner f64 (3), or
     None where float32 holds the points as they are.
 
-    ends: the least and the greatest coordinates after the division.
+    ends: the least and the greatest coordinates after the division. A small object may lie too far away for float32 nearer
+    than a map does; of files in float32 nothing could be saved.
     """
-    far = max(np.abs(end).max() for end in ends) > _FAR_AWAY
+    farthest, widest = max(np.abs(end).max() for end in ends), (ends[1] - ends[0]).max()
+    single = all(frame.dtype == np.float32 for frame in frames)
+    far = farthest > _FAR_AWAY or (not single and 0 < widest < np.spacing(np.float32(farthest)) / _FINE)
     if divisor == 1 and not far:
         points = np.empty((sum(map(len, frames)), 3), np.float32)  # by rows, where frames lie by columns
         return np.concatenate(frames, out=points, casting="same_kind"), None
@@ -201,11 +206,15 @@ def _joined(
     return (points - corner).astype(np.float32), corner if far else None
 
 
-def _rounded(frames: Sequence[np.ndarray], ends: np.ndarray, divisor: float) -> dict[str, int]:
-    """Returns a note where coordinates lie so far away that the float32 they were stored in rounded them. ends: f64 (T,2,3)."""
+def _rounded(frames: Sequence[np.ndarray], ends: np.ndarray, divisor: float, coarse: float) -> dict[str, int]:
+    """Returns a note where coordinates lie so far away that the float32 they were stored in rounded them.
+
+    ends: f64 (T,2,3). coarse: the step between neighboring numbers that is too much, after the division, however wide it is.
+    """
     single = [k for k, frame in enumerate(frames) if frame.dtype == np.float32]
-    farthest = np.float32(np.abs(ends[single]).max(initial=0))
-    return {COARSE: 1} if np.spacing(farthest) / divisor > _COARSE else {}
+    step = float(np.spacing(np.float32(np.abs(ends[single]).max(initial=0))))
+    widest = float((ends[:, 1].max(0) - ends[:, 0].min(0)).max())
+    return {COARSE: 1} if step / divisor > coarse or 0 < _COARSE * widest < step else {}
 
 
 def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,6 +14,7 @@ from dpcli.segment.multibody.frames import Frames
 from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
+from dpcli.segment.multibody.point_fit import NUMBER_PRICE
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.splits import split_bodies
 from dpcli.segment.multibody.viewpoint import find_camera
@@ -36,6 +38,8 @@ def explain_sequence(
     that it can't see need no match. threads: in which what is tried is judged side by side; they change no result.
     """
     frames = Frames(clouds)
+    if len(clouds) == 2:
+        settings = replace(settings, body_price=max(settings.body_price, _least_price(frames)))
     with ThreadPoolExecutor(threads) as pool:
         hypotheses = find_hypotheses(frames, pool.map)
         search = Search(frames, settings, hypotheses, pool.map)
@@ -46,6 +50,14 @@ def explain_sequence(
             found = search.begin()
         found = turn_least(search.frames, search.improve(found))
         return search.judged_anew(simplify_motions(search.frames, found))
+
+
+def _least_price(frames: Frames) -> float:
+    """Returns the least price of a body between two frames, as a share of all points: the six numbers of its motion.
+
+    There one other frame judges every point, and many small bodies fit it by chance. More frames even that out.
+    """
+    return 6 * NUMBER_PRICE / len(frames.points)
 
 
 class Search:

@@ -15,7 +15,11 @@ class MultibodySettings:
     """
 
     most_bodies: int = setting(24, "multibody: bodies of a sequence at most.", least=1)
-    body_price: float = setting(0.001, "multibody: cost of a further body, as a share of all points.", least=0)
+    body_price: float = setting(
+        0.001,
+        "multibody: cost of a further body, as a share of all points; between two frames, at least 9 points.",
+        least=0,
+    )
     border: float = setting(0.3, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
     agreement: float = setting(
         0.3, "multibody: cost of a point whose nearest points in other frames are all in other bodies.", least=0

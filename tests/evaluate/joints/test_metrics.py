@@ -55,7 +55,21 @@ def test_errors_are_those_of_the_definition():
     found = joint_statistics(PART, TRUTH, PART, field)
     assert (found.joints, found.predicted, found.edges, found.types, found.axes, found.near) == (2, 2, 1, 1, 2, 0)
     assert found.angles == pytest.approx([8]) and found.distances == pytest.approx([0.2])
-    assert found.turns == pytest.approx([np.degrees(0.1) / 2]) and found.slides == []
+    assert found.turns == pytest.approx([np.degrees(0.1)]) and found.slides == []
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 8])
+def test_frame_0_whose_value_is_0_by_definition_does_not_dilute_the_error(frames):
+    turns, shifts = np.linspace(0, 1, frames), np.linspace(0, 0.3, frames)
+    truth = joints(
+        (1, 0, REVOLUTE, (0, 0, 1), (1, 0, 0), turns), (2, 0, PRISMATIC, (1, 0, 0), (0, 0, 0), shifts), frames=frames
+    )
+    off = truth.copy()
+    off[1:, 1, VALUE] += np.radians(3)  # a constant error in every frame that has one
+    off[1:, 2, VALUE] -= 0.05
+    found = joint_statistics(PART, truth, PART, off)
+    assert found.turns == pytest.approx([3] if frames > 1 else [])
+    assert found.slides == pytest.approx([0.05] if frames > 1 else [])
 
 
 def test_wrong_types_and_unmatched_parts_count_as_missed():

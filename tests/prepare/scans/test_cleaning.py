@@ -114,6 +114,20 @@ def test_map_coordinates_that_float32_rounded_are_told(tmp_path, kind, rounded):
     assert (COARSE in reader.read(reader.items()[0], np.random.default_rng(0)).notes) is rounded
 
 
+@pytest.mark.parametrize("unit", ["m", "mm", "span"])
+@pytest.mark.parametrize("size", [0.003, 0.05, 1.0, 40.0])
+@pytest.mark.parametrize("away", [0.0, 30, 900, 9000, 2e5])
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_float32_rounds_no_small_object_without_a_word(unit, size, away, kind):
+    exact = POINTS / np.ptp(POINTS) * size + away * np.array([1, -0.9, 0.8])
+    stored = exact.astype(kind)
+    sample = assemble(Item("a", Path("a")), [Cloud(stored)] * 2, Lengths(None, unit))
+    found, shift = sample.sequence.frame(0), sample.sequence.shift
+    off = np.abs(found + (0 if shift is None else shift) - exact).max() / size
+    assert off < 1e-4 or (kind == "f4" and (off < 0.01 or {COARSE, CROWDED} & set(sample.notes)))
+    assert shift is None or away >= 30
+
+
 def test_shards_and_merges_keep_shifts(tmp_path):
     for k in range(3):
         frames_of(tmp_path / "in" / f"s{k}", POINTS + 1e6 * k)

@@ -105,6 +105,23 @@ def test_a_tilted_motion_that_fits_beats_one_that_slides_in_its_own_plane():
     assert np.concatenate(gaps).mean() < 0.045
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_frames_are_not_explained_by_many_small_bodies(seed):
+    """One other frame alone judges every point then, and each patch finds a place that fits it by chance."""
+    rng, clouds, part = np.random.default_rng(seed), [], np.repeat([0, 0, 1], [120, 60, 60])
+    swing = turn(1.1, (0.0, 0.0, 1.0), (0.04, 0.04, 0.5))
+    for motion in (np.eye(4), swing):  # the jib of a crane
+        base, post = (
+            box_surface(rng, 120, (0, 0, 0), (0.6, 0.4, 0.05)),
+            box_surface(rng, 60, (0, 0, 0.05), (0.05, 0.05, 0.5)),
+        )
+        jib = box_surface(rng, 60, (0, 0, 0.5), (0.6, 0.08, 0.04)) @ motion[:3, :3].T + motion[:3, 3]
+        clouds.append(np.float32(np.concatenate([base, post, jib]) - 0.3))
+    found = explain_sequence(clouds, MultibodySettings())  # 9, 16 and 10 bodies where each cost next to nothing
+    assert len(found.bodies) == 2
+    assert rand_index(torch.tensor(found.label), torch.tensor(np.tile(part, 2))) > 0.85
+
+
 @pytest.mark.parametrize(("unit", "place"), [(1e-3, (0, 0, 0)), (40.0, (5e4, -3e4, 100))])
 def test_units_and_places_change_nothing_much(unit, place):
     labels, _ = predicted(chest(unit=unit, place=place))
