@@ -252,6 +252,7 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
         pixels = np.asarray(image.convert("RGB")).astype(int)
     first = pixels[22 : 22 + 120 : 5, 4 : 4 + 160 : 5]  # truth of view 0, frame 0: 5 pixels for each, to fill the cell
     assert np.abs(first / 255 - white(clip()[0, 0]))[10:, 10:].max() < 0.01  # but for the frame's number
+    assert pixels.shape[:2] == (4 + 4 * (18 + 3 * 120 + 4), 4 + 3 * (160 + 4))  # nothing between the three pictures
     assert isinstance(run(said, "--truth", truth, "--picture", tmp_path / "no" / "x.png").exception, DataError)
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)
 
