@@ -86,6 +86,8 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc_here, one_th
     rows = json.loads((tmp_path / "scene.fit" / "log.json").read_text())
     assert result.metrics["psnr_reference"] > 22 and result.metrics["psnr_reference"] > rows[0]["psnr"] + 2
     assert {row["stage"] for row in rows} == {"dense", "sparse"}
+    seconds = [row["seconds"] for row in rows]
+    assert seconds == sorted(seconds) and 0 < seconds[3] < seconds[-1] <= result.metrics["seconds"]
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
