@@ -89,22 +89,22 @@ def _letters_of(text: str) -> frozenset[int]:
 def _of_pillow() -> frozenset[int]:
     from PIL import ImageFont
 
-    return _of_bytes(ImageFont.load_default(size=10).font_bytes)
+    return _charted(BytesIO(ImageFont.load_default(size=10).font_bytes))
 
 
 @cache
 def _of_file(path: str) -> frozenset[int]:
     """Returns the letters of a font file; none where it can't be read."""
     try:
-        return _of_bytes(Path(path).read_bytes())
+        return _charted(path)
     except (OSError, RuntimeError, ValueError):
         return frozenset()
 
 
-def _of_bytes(font: bytes) -> frozenset[int]:
+def _charted(font: str | BytesIO) -> frozenset[int]:
     from matplotlib.ft2font import FT2Font
 
-    return frozenset(FT2Font(BytesIO(font)).get_charmap())
+    return frozenset(FT2Font(font).get_charmap())
 
 
 @cache
