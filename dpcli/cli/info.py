@@ -106,8 +106,9 @@ def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
+        other = "a scene: dpc generate4d render" if kind == "gaussians" else "scores: dpc evaluate classification"
         raise UsageError(
-            f"--picture draws point clouds and views, this file holds {kind!r}; for scores: dpc evaluate classification"
+            f"--picture draws point clouds and views, this file holds {kind!r}; for {other} --picture FILE"
         )
     check_target(picture, "--picture", FIGURES)
     if kind == "views":

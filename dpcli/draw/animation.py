@@ -138,11 +138,10 @@ def _even(picture: np.ndarray) -> np.ndarray:
 
 
 def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    from PIL import Image
 
     whole = list(pictures)
     table = _color_table(np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1))
-    images = [Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE) for picture in whole]
+    images = [_numbered(picture, table) for picture in whole]
     # GIF counts in hundredths of a second, and players slow down below two
     ends = np.arange(len(images) + 1) * max(2.0, 100 / fps)
     pauses = (np.diff(np.rint(ends)) * 10).astype(int).tolist()
@@ -164,6 +163,18 @@ def _color_table(picture: np.ndarray) -> Image.Image:
     table = Image.new("P", (1, 1))
     table.putpalette([*colors[: 3 * _COLORS], frequent >> 16, frequent >> 8 & 255, frequent & 255])
     return table
+
+
+def _numbered(picture: np.ndarray, table: Image.Image) -> Image.Image:
+    """Returns a picture in the colors of a table, the table's last color exactly: Pillow gives colors that differ in their last
+    two bits one number, so that white is 252 where the table has such a gray.
+    """
+    from PIL import Image
+
+    numbers = Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE)
+    colors = np.array(table.getpalette(), np.uint8).reshape(-1, 3)
+    numbers.paste(len(colors) - 1, mask=Image.fromarray((picture == colors[-1]).all(-1)))
+    return numbers
 
 
 def _png(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from dpcli.counted import counted
+from dpcli.draw.fonts import families_with, tell_lacking, text_font
 from dpcli.draw.palette import DARK, RGB, Theme
 from dpcli.errors import DataError
-from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import whole_file
 from dpcli.standard_streams import printable
 
@@ -53,7 +52,7 @@ def contact_sheet(rows: Sequence[SheetRow], theme: Theme = DARK) -> Any:
         for column, (mark, cell) in enumerate(zip(row.marks, row.cells, strict=True)):
             left = GAP + column * (width + GAP)
             sheet.paste(Image.fromarray(cell), (left, top + TITLE_HEIGHT))
-            draw.text((left + 4, top + TITLE_HEIGHT + 2), mark, fill=theme.faint, font=text_font(10))
+            draw.text((left + 4, top + TITLE_HEIGHT + 2), mark, fill=theme.faint, font=text_font(10, mark))
     return sheet
 
 
@@ -64,13 +63,6 @@ def spread_evenly(count: int, most: int) -> list[int]:
     ([0, 4, 8], [0, 1], [])
     """
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
-
-
-def text_font(size: int) -> Any:
-    """Returns the font of all sheets, letters `size` pixels high."""
-    from PIL import ImageFont
-
-    return ImageFont.load_default(size=size)
 
 
 def shortened(text: str, most: int) -> str:
@@ -85,7 +77,8 @@ def shortened(text: str, most: int) -> str:
 
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB) -> None:
     """Writes a text in one line on a PIL drawing, shortened to the width (pixels) there is; names may hold ends of lines."""
-    font, text = text_font(13), printable(text)
+    text = printable(text)
+    font = text_font(13, text)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"
     draw.text(place, text, fill=ink, font=font)
@@ -103,17 +96,30 @@ def save_picture(image: Any, path: Path) -> None:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Writes a matplotlib figure, whole or not at all, and warns of letters that its font lacks. Raises DataError when it can't be
-    written."""
+    """Writes a matplotlib figure, whole or not at all, with letters that its font lacks from others of this computer; warns of
+    those that none has. Raises DataError when it can't be written.
+    """
     try:
-        with whole_file(path) as part, warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            figure.savefig(part, dpi=dpi)
+        with whole_file(path) as part:
+            if lacking := _save(figure, part, dpi):
+                names, lacking = families_with(lacking)
+                _add_families(figure, names)
+                _save(figure, part, dpi)
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
-    lacking = {found[1] for one in told if (found := _NO_LETTER.search(str(one.message)))}
-    if lacking:
-        log.warn(
-            f"{path}: the font of pictures lacks {counted(len(lacking), 'letter')} of the names, which are boxes there;"
-            " names in Latin, Greek or Cyrillic letters are shown"
-        )
+    tell_lacking(lacking)
+
+
+def _save(figure: Figure, path: Path, dpi: int) -> set[int]:
+    """Writes a figure and returns the letters (numbers in Unicode) that its fonts lack."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        figure.savefig(path, dpi=dpi)
+    return {int(found[1]) for one in told if (found := _NO_LETTER.search(str(one.message)))}
+
+
+def _add_families(figure: Figure, names: list[str]) -> None:
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_fontfamily([*text.get_fontfamily(), *names])

@@ -33,7 +33,7 @@ class FitRun:
     ) -> None:
         self.optimizer, self.folder, self.stop, self.preview = optimizer, folder, stop, preview
         self.steps = optimizer.config.steps
-        self.seconds = 0.0
+        self.seconds, self._counted = 0.0, time.monotonic()
         self.recent: dict[str, list[float]] = {}
         self._gaussians = 0
 
@@ -44,7 +44,7 @@ class FitRun:
         """
         state = self.folder.load_state()
         self._restore(state) if state is not None else self._start()
-        started = time.monotonic()
+        self._counted = time.monotonic()
         with Progress("fit", self.steps, "step") as bar:
             bar.skip(self.optimizer.step)
             while self.optimizer.step < self.steps:
@@ -57,7 +57,7 @@ class FitRun:
                 bar.advance()
                 step = self.optimizer.step
                 if step % _SAVE_EVERY == 0 or self.stop.requested or step == self.steps:
-                    self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
+                    self._count_seconds()
                     self.folder.save_state({**self.optimizer.state(), "spent": self.seconds, "recent": self.recent})
                 self.stop.check(f"saved at step {step}")
         self.folder.draw_curves()
@@ -96,11 +96,16 @@ class FitRun:
             self.recent.setdefault("squared", []).append(result.squared_error)
         self._gaussians, step = result.gaussians, self.optimizer.step
         if step % _LOG_EVERY == 0 or step == self.steps:
+            self._count_seconds()
             stage = "sparse" if self.optimizer.model.control is not None else "dense"
             self.folder.log({"step": step, "stage": stage, "seconds": round(self.seconds, 1), **self._averages()})
             self.recent = {key: values[-_AVERAGED:] for key, values in self.recent.items()}
         if self.preview is not None and step % self._between_previews == 0:
             self.preview(self.optimizer.model)
+
+    def _count_seconds(self) -> None:
+        now = time.monotonic()
+        self.seconds, self._counted = self.seconds + now - self._counted, now
 
     def _averages(self) -> dict:
         """Returns the mean loss and PSNR of the latest steps, and the number of Gaussians."""

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from dpcli.draw.animation import write_pictures
+from dpcli.draw.fonts import text_font
 from dpcli.draw.palette import LIGHT, part_colors
 from dpcli.draw.points import Raster, draw_balls
-from dpcli.draw.sheet import save_picture, spread_evenly, text_font, write_line
+from dpcli.draw.sheet import save_picture, spread_evenly, write_line
 from dpcli.draw.view import turntable_view
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence

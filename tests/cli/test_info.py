@@ -18,7 +18,9 @@ from dpcli.draw.page.scatter import scatter_page
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.sequence_pass import Keeping
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from dpcli.store.gaussians import write_scene
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
+from tests.support.scenes import toy_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -141,10 +143,12 @@ def test_bad_pipes_are_explained(clouds: Path) -> None:
     assert_explained(dpc("evaluate", "classification", "-", stdin=b"no HDF5 at all"), 3, "not an HDF5 file")
 
 
-def test_a_file_of_another_kind_says_which(clouds: Path, scores: Path) -> None:
+def test_a_file_of_another_kind_says_which(clouds: Path, scores: Path, tmp_path: Path) -> None:
     assert_explained(dpc("evaluate", "classification", clouds), 3, "'clouds'", "'scores'")
     assert_explained(dpc("evaluate", "classification", scores, "--truth", scores), 3, "'scores'", "'clouds'")
-    assert_explained(dpc("info", scores, "--picture", "x.png"), 2, "'scores'")
+    assert_explained(dpc("info", scores, "--picture", "x.png"), 2, "'scores'", "dpc evaluate classification")
+    write_scene(tmp_path / "scene.h5", toy_scene())
+    assert_explained(dpc("info", tmp_path / "scene.h5", "--picture", "x.png"), 2, "'gaussians'", "generate4d render")
 
 
 def test_evaluate_from_a_pipe_equals_a_file(scores: Path, clouds: Path) -> None:

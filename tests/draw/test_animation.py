@@ -108,14 +108,15 @@ def test_an_animation_has_one_table_of_colors(tmp_path):
     np.testing.assert_array_equal(np.unique([picture[0, 0] for picture in shown], axis=0), [shown[0][0, 0]])
 
 
-def test_the_ground_of_an_animation_keeps_its_color(tmp_path):
-    """Among many more colors than an animation has: white stays white."""
+@pytest.mark.parametrize("lowest, shades", [(180, 3), (245, 1)])
+def test_the_ground_of_an_animation_keeps_its_color(tmp_path, lowest, shades):
+    """Among many more colors than an animation has, and beside a few that are nearly white: white stays white."""
     from PIL import Image
 
     rng = np.random.default_rng(0)
     pictures = [np.full((60, 80, 3), 255, np.uint8) for _ in range(6)]
     for picture in pictures:
-        picture[10:40, 10:60] = rng.integers(180, 256, (30, 50, 3))
+        picture[10:40, 10:60] = rng.integers(lowest, 256, (30, 50, shades))
     write_pictures(tmp_path / "a.gif", pictures, fps=10)
     with Image.open(tmp_path / "a.gif") as image:
         assert (np.asarray(image.convert("RGB"))[:5] == 255).all()

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import read_scene, scene_origin
 from dpcli.store.views import ViewsHeader, ViewsWriter
+from tests.support.scenes import toy_scene
 
 SIZE, FRAMES = 48, 6
 
@@ -86,6 +88,8 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc_here, one_th
     rows = json.loads((tmp_path / "scene.fit" / "log.json").read_text())
     assert result.metrics["psnr_reference"] > 22 and result.metrics["psnr_reference"] > rows[0]["psnr"] + 2
     assert {row["stage"] for row in rows} == {"dense", "sparse"}
+    seconds = [row["seconds"] for row in rows]
+    assert seconds == sorted(seconds) and 0 < seconds[3] < seconds[-1] <= result.metrics["seconds"]
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
@@ -114,6 +118,13 @@ def test_given_views_that_are_not_used_are_told(train, prior, told, tmp_path, ca
     views = toy_views(tmp_path / "views.h5", train)
     fit._load(views, FitConfig(size=16), Supervision(prior=prior))
     assert ("2 of its views may be fitted to, too, but only --prior views" in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize("logit, told", [(-4.0, True), (1.0, False)])
+def test_an_object_that_faded_away_is_told(logit, told, capsys):
+    scene = toy_scene()
+    fit._tell_faint(replace(scene, opacity_logit=np.full_like(scene.opacity_logit, logit)))
+    assert ("the most opaque has 0.018" in capsys.readouterr().err) == told
 
 
 def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):

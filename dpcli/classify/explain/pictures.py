@@ -10,9 +10,10 @@ import numpy as np
 
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud
 from dpcli.draw.animation import write_pictures
+from dpcli.draw.fonts import text_font
 from dpcli.draw.palette import DARK, heat_colors
 from dpcli.draw.points import Raster, draw_dots
-from dpcli.draw.sheet import save_figure, save_picture, shortened, spread_evenly, text_font, write_line
+from dpcli.draw.sheet import save_figure, save_picture, shortened, spread_evenly, write_line
 
 ANIMATIONS = (".gif", ".mp4")
 _CELL, _GAP, _TITLE, _MARGIN = 132, 3, 20, 58  # pixels: of a cell, between cells, of a title's line, left of the rows
@@ -96,11 +97,11 @@ def _sheet(blocks: list[tuple[str, list[str], dict[str, list[np.ndarray]]]]) -> 
         write_line(draw, (_GAP + 3, top + 1), words, size[0] - 2 * _GAP, DARK.ink)
         for row, (label, cells) in enumerate(rows.items()):
             y = top + _TITLE + row * step
-            draw.text((_GAP + 3, y + _CELL // 2 - 7), label, fill=DARK.ink, font=text_font(12))
+            draw.text((_GAP + 3, y + _CELL // 2 - 7), label, fill=DARK.ink, font=text_font(12, label))
             for column, (head, cell) in enumerate(zip(heads, cells)):
                 sheet.paste(Image.fromarray(cell), (_MARGIN + column * step, y))
                 if row == 0:
-                    draw.text((_MARGIN + column * step + 4, y + 2), head, fill=DARK.faint, font=text_font(11))
+                    draw.text((_MARGIN + column * step + 4, y + 2), head, fill=DARK.faint, font=text_font(11, head))
         top += height
     draw.text((_GAP + 3, top + 2), "least", fill=DARK.faint, font=text_font(11))
     bar = np.repeat(heat_colors(np.linspace(0, 1, 160))[None], 10, axis=0)

@@ -32,7 +32,7 @@ class FileMetrics:
     names (n): the samples, of the kind `kind` (samples, sequences, views). metric: of these. per_sample f64 (n): the
     value of each sample by itself, by metric, NaN = undefined, for those metrics that have one. units: by metric.
     must_equal: facts that must be equal on both sides of a comparison, by name. must_equal_by_sample: the same sample by
-    sample. correct bool (n): whether a classifier is right. left_out: as in a report.
+    sample. correct bool (n): whether a classifier is right. left_out, notes: as in a report.
     """
 
     source: str
@@ -48,6 +48,7 @@ class FileMetrics:
     seed: int | None = None
     provenance: list[dict] = field(default_factory=list)
     correct: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
 
     def values(self) -> dict[str, float]:
         """Returns the metrics of all samples together; NaN = undefined."""

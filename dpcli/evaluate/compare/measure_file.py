@@ -180,7 +180,8 @@ def _measure_video(path: Path, source: str, options: EvaluationOptions) -> FileM
     values, units = view_values(report)
     protocol = {"protocol": describe_protocol(report.protocol)}
     found = metrics_of_values(source, "video", "views", values, units, protocol)
-    return replace(found, left_out=report.left_out, seed=history_seed(report.history), provenance=report.history)
+    history, notes = report.history, report.notes
+    return replace(found, left_out=report.left_out, seed=history_seed(history), provenance=history, notes=notes)
 
 
 def _values_of_single_samples(metric: WeightedMetric, samples: int, asked: Sequence[str]) -> dict[str, np.ndarray]:

@@ -111,6 +111,7 @@ def evaluate_compare(
         for task in own
         if task not in other
     ]
+    notes += [f"{letter}: {note}" for letter, side in zip("AB", sides) for one in side for note in one.notes]
     notes += _few_samples(parts[0], resampling)
     return CompareReport(sources, options, resampling, parts, (sides[0][0].provenance, sides[1][0].provenance), notes)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,9 @@ _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators 
 
 @dataclass(frozen=True)
 class Run:
-    """Holds the metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first."""
+    """Holds the metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first;
+    `notes`: on how it was evaluated.
+    """
 
     title: str
     source: str
@@ -32,6 +34,7 @@ class Run:
     metrics: dict[str, float | None]
     units: dict[str, str]
     identity: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,8 @@ def _file_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]
     identity = {"kind": "file", "samples": samples_json(found[0].kind, found[0].names), **_facts(found)}
     title = f"seed {found[0].seed}" if found[0].seed is not None else Path(source).stem
     metrics = {key: None if math.isnan(value) else value for key, value in values.items()}
-    return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity)]
+    notes = [note for one in found for note in one.notes]
+    return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity, notes)]
 
 
 def _facts(found: Sequence[FileMetrics]) -> dict[str, Any]:
@@ -172,6 +176,7 @@ def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
         metrics,
         {key: str(own["units"][key]) for key in metrics},
         identity,
+        [note for note in own.get("notes") or [] if isinstance(note, str)],
     )
 
 

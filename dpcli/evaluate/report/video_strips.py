@@ -35,7 +35,7 @@ def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", backgro
             pictures = zip(shown, source.pictures(ours, shown), true_source.pictures(theirs, shown), strict=True)
             for frame, predicted_picture, true_picture in pictures:
                 strip(true_source.views[theirs], frame, count, predicted_picture, true_picture)
-    html = "".join(_markup(title, cells) for title, cells in strip.rows.items())
+    html = "".join(_markup(title, cells) for title, cells in strip.cells().items())
     note = f"{min(len(pairs), _MOST_VIEWS)} of {len(pairs)} views, {_INSTANTS} instants at most, made smaller."
     return Figure("Pictures side by side", html, note)
 
@@ -45,7 +45,7 @@ def _markup(title: str, cells: Sequence[tuple[int, np.ndarray]]) -> str:
 
     sheet = np.concatenate([own for _, own in cells], axis=1)
     stream = io.BytesIO()
-    Image.fromarray((sheet * 255 + 0.5).astype(np.uint8)).save(stream, "JPEG", quality=_QUALITY)
+    Image.fromarray(sheet).save(stream, "JPEG", quality=_QUALITY)
     data = base64.b64encode(stream.getvalue()).decode("ascii")
     frames = ", ".join(str(frame) for frame, _ in cells)
     words = escape(f"{title}; frames {frames}")

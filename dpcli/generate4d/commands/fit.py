@@ -39,6 +39,8 @@ from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write
 from dpcli.store.views import ViewsReader
 from dpcli.store.writing.already_made import already_made
 
+_SEEN = 0.3  # opacity of a Gaussian that `export --as clouds` takes for a point of the object
+
 
 def fit_scene(
     views: str,
@@ -84,6 +86,16 @@ def fit_scene(
         f"reference view {metrics['psnr_reference']:.2f} dB PSNR, {metrics['gaussians']} Gaussians,"
         f" {metrics['seconds']:.0f} s"
     )
+    _tell_faint(scene)
+
+
+def _tell_faint(scene: GaussianScene) -> None:
+    """Warns where a fit let the object fade away: of a small or thin one, an empty picture has a high PSNR, too."""
+    if (most := float(scene.opacity.max())) < _SEEN:
+        log.warn(
+            f"no Gaussian is {_SEEN} opaque or more, the most opaque has {most:.2g}: hardly anything of the object is seen, whatever "
+            "the PSNR; fit larger pictures (--size) or for more steps, of a clip in which the object is larger"
+        )
 
 
 def _groups(config: FitConfig, supervision: Supervision) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from dpcli.draw.learning_curves import Curve, Panel, draw_learning_curves
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """Writes three panels of the log's rows as a PNG; a dotted line stands where the sparse stage begins."""
-    change = next((row["step"] for row in rows if row["stage"] == "sparse"), None)
+    """Writes three panels of the log's rows as a PNG; a dotted line stands at the last row of the dense stage."""
+    sparse = any(row["stage"] == "sparse" for row in rows)
+    change = max((row["step"] for row in rows if row["stage"] == "dense"), default=None) if sparse else None
     panels = [
         Panel("PSNR, reference view", [Curve("psnr", "PSNR")], "dB", change=change),
         Panel("loss", [Curve("loss", "loss")], logarithmic=True, change=change),

@@ -244,8 +244,10 @@ def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
                     f"{path.parent}: 16-bit gray of which a picture nowhere exceeds 255 is taken for 0 to 255 there; store "
                     "8 bits where it is nearly black instead"
                 )
+        level = image.info.get("transparency")  # of PNG: what is see-through
+        clear = (gray == level) & isinstance(level, int)
         gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
-        return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
+        return np.dstack([gray, gray, gray, np.where(clear, 0, 255).astype(np.uint8)])
     return np.array(image.convert("RGBA"))
 
 

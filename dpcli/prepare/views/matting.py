@@ -19,6 +19,11 @@ _RIM = 2  # pixels on each side of an outline where object and background mix
 HOLES = ("auto", "keep", "cut")
 _GAP = 0.005  # of the object: what may be a gap between limbs
 _FLAT = 4.0  # gray levels that a gap may be off the background more than the background itself: noise of compression
+_SOFT, _MANY, _TOGETHER = (
+    200,
+    50,
+    0.6,
+)  # alpha below, pixels at least, and correlation above, to tell colors that fade with alpha
 _SPECK = 1e-4  # of the picture: smaller islands are noise
 
 
@@ -211,6 +216,19 @@ def cut_alone(rgba: np.ndarray, name: str, background: str, tolerance: float, ho
         return clear_invisible(rgba)
     color = background_color([border_pixels(rgba[..., :3])], [name], background, tolerance)
     return key_out(rgba[..., :3], color, tolerance, holes)[0]
+
+
+def fades_to_black(rgba: np.ndarray) -> bool:
+    """Returns whether colors of u8 (H,W,4) become dark as alpha becomes faint, as those that were multiplied by it (premultiplied).
+
+    No channel is above alpha then. That of a black outline isn't either, but it is as dark where alpha is high.
+    """
+    alpha, brightest = rgba[..., 3].astype(np.float64), rgba[..., :3].max(-1)
+    soft = (alpha >= 2 * FAINT) & (alpha <= _SOFT)
+    alpha, brightest = alpha[soft], brightest[soft].astype(np.float64)
+    if len(alpha) < _MANY or (brightest <= alpha + 2).mean() < 0.999 or not np.ptp(alpha) or not np.ptp(brightest):
+        return False
+    return bool(np.corrcoef(alpha, brightest)[0, 1] > _TOGETHER)
 
 
 def clear_invisible(rgba: np.ndarray) -> np.ndarray:

@@ -82,7 +82,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
         0,
         (options.size, options.size),
     )
-    azimuths = [f"{np.rad2deg(orbit_of(pose)[0]):.0f}" for pose in poses]
+    azimuths = [str(round(float(np.rad2deg(orbit_of(pose)[0])))) for pose in poses]  # no "-0"
     log.info(f"{path}: {len(views)} still cameras, azimuths in degrees: {first_names(azimuths, 12)}")
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:

@@ -187,7 +187,7 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
-    boxes, cut_off, good, empty, apart, whole = [], [], [], [], [], 0
+    boxes, cut_off, good, empty, apart, dark, whole = [], [], [], [], [], [], 0
     for index, rgba in zip(wanted, cutter.cut(wanted)):
         box = visible_box(rgba, _ISLAND)
         if box is None:
@@ -200,6 +200,8 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
             cut_off.append(index)
         if pieces(rgba, _OBJECT) > 1:
             apart.append(index)
+        if cutter.mode == "alpha" and matting.fades_to_black(rgba):
+            dark.append(index)
     _report_empty(frames, empty, good, cutter.mode, options.on_error)
     if whole == len(good):
         raise DataError(
@@ -212,6 +214,11 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         log.warn(
             f"{frames.path}: several objects apart in {_named(frames, apart)}; everything after this takes them for one."
             " Cut one out with --mask FOLDER"
+        )
+    if 2 * len(dark) > len(good):
+        log.warn(
+            f"{frames.path}: colors fade to black with the alpha in {_named(frames, dark)}, as those that were multiplied by it; they"
+            " are taken as they are, so the outline will be dark; export straight (unassociated) alpha"
         )
     if cutter.options.holes == "auto" and any(cutter.gaps.values()):
         count = sum(gap > 0 for gap in cutter.gaps.values())

@@ -42,6 +42,7 @@ _FULL_RANGE = 2
 _ALPHA_LAYER = re.compile(rb"\x4e[\x01\x09]\xa5")  # supplemental information of HEVC, of type 165: of an alpha channel
 _HEAD = 1024  # bytes of a packet that hold such information, before its picture
 _ASKEW = 0.02  # of a display matrix: a degree
+_EXACTLY = 2 | 0x2000 | 0x40000  # FFmpeg's bilinear, full_chroma_int, accurate_rnd
 
 
 @dataclass(frozen=True)
@@ -411,8 +412,10 @@ def _levels(frame, width: int, options: dict[str, int]) -> np.ndarray:
     """Returns u8 (H,W,4) of a frame, opaque where it has no alpha.
 
     FFmpeg's fast way from 4:2:0 and 4:2:2 to four bytes a pixel leaves the last columns of most widths unwritten, whatever
-    memory held: so three bytes are asked for, and planes where there is alpha.
+    memory held: so three bytes are asked for, and planes where there is alpha. It also rounds down, so that white of 10 bits is 253,
+    unless it is asked to be exact; into 16 bits a channel, being exact breaks it.
     """
+    options = {**options, "interpolation": _EXACTLY}
     if not _has_alpha(frame):
         rgb = frame.reformat(width, frame.height, "rgb24", **options).to_ndarray()
         return np.dstack((rgb, np.full(rgb.shape[:2], 255, np.uint8)))

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.fonts import text_font
 from dpcli.draw.palette import part_colors
 from dpcli.draw.points import Raster, draw_balls
-from dpcli.draw.sheet import save_picture, text_font, write_line
+from dpcli.draw.sheet import save_picture, write_line
 from dpcli.draw.view import turntable_view
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree
 from dpcli.store.joints import FIXED, PRISMATIC, REVOLUTE, TYPES
@@ -44,7 +45,7 @@ def joints_picture(path: Path, tree: KinematicTree, title: str) -> None:
     for row, (text, color) in enumerate(lines):
         top = _CELL + _LINE * (row + 1) + 6
         draw.ellipse((10, top + 4, 20, top + 14), fill=color)
-        draw.text((28, top), text, fill=_INK, font=text_font(12))
+        draw.text((28, top), text, fill=_INK, font=text_font(12, text))
     save_picture(sheet, path)
 
 

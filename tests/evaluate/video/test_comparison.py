@@ -237,6 +237,31 @@ def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path:
     assert json.loads(runs.stdout)["metrics"]["psnr"]["mean"] == pytest.approx(np.mean(expected))
 
 
+def test_what_a_video_is_said_to_be_compared_as_is_said_of_two_and_of_many(tmp_path: Path, truth: Path) -> None:
+    """A clip without alpha of other moments, one without times, and the first one's JSON object."""
+    Image.fromarray(clip()[0, 0]).save(
+        first := tmp_path / "a.webp",
+        save_all=True,
+        append_images=[Image.fromarray(frame) for frame in clip()[0, 1:]],
+        duration=[30, 170, 100],
+        lossless=True,
+    )
+    np.save(second := tmp_path / "b.npy", white(clip()[0]).astype(np.float32))
+    lone = write(tmp_path / "lone.h5", clip(views=1), header(ROLES[:1]))
+    single = json.loads(run(first, "--truth", lone, "--metrics", "psnr", "--json").stdout)
+    assert any("filmed at other moments" in note for note in single["notes"])
+    (tmp_path / "c.json").write_text(json.dumps(single))
+    shared = ["--truth", str(lone), "--metrics", "psnr", "--json"]
+    invoke = lambda *words: json.loads(CliRunner().invoke(evaluate.ROOM.application(), words).stdout)  # noqa: E731
+    notes = invoke("compare", str(first), str(second), *shared)["notes"]
+    assert [note for note in notes if note.startswith("A: ")] == [f"A: {note}" for note in single["notes"]]
+    assert any(note.startswith("B: ") and "no alpha" in note for note in notes)
+    notes = invoke("runs", str(first), str(second), *shared)["notes"]
+    assert [note for note in notes if note.startswith("a: ")] == [f"a: {note}" for note in single["notes"]]
+    notes = invoke("runs", str(tmp_path / "c.json"), "--json")["notes"]
+    assert notes == [f"a: {note}" for note in single["notes"]]
+
+
 def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path, tmp_path: Path) -> None:
     strip = tmp_path / "strip.png"
     result = run(said, "--truth", truth, "--markdown", "--picture", strip)
@@ -252,6 +277,7 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
         pixels = np.asarray(image.convert("RGB")).astype(int)
     first = pixels[22 : 22 + 120 : 5, 4 : 4 + 160 : 5]  # truth of view 0, frame 0: 5 pixels for each, to fill the cell
     assert np.abs(first / 255 - white(clip()[0, 0]))[10:, 10:].max() < 0.01  # but for the frame's number
+    assert pixels.shape[:2] == (4 + 4 * (18 + 3 * 120 + 4), 4 + 3 * (160 + 4))  # nothing between the three pictures
     assert isinstance(run(said, "--truth", truth, "--picture", tmp_path / "no" / "x.png").exception, DataError)
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)
 

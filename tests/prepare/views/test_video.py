@@ -415,6 +415,24 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     assert "3.png follows 1.png" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", ["straight", "premultiplied", "black", "outlined", "hard"])
+def test_colors_that_were_multiplied_by_alpha_are_told(tmp_path, capfd, kind):
+    """A soft disc, textured; black, with a black outline, or with a hard one it is told nothing of."""
+    y, x = np.mgrid[:96, :96] + 0.5
+    away = np.hypot(x - 48, y - 48)
+    for frame in range(2):
+        rgba = np.zeros((96, 96, 4), np.uint8)
+        rgba[..., 3] = 255 * np.clip((40 - away) / (0.01 if kind == "hard" else 4), 0, 1)
+        rgba[..., :3] = 150 + 80 * np.sin(x[..., None] / 5 + frame + np.arange(3))
+        if kind == "premultiplied":
+            rgba[..., :3] = np.round(rgba[..., :3] * (rgba[..., 3:] / 255))
+        if kind in ("black", "outlined"):
+            rgba[away > (0 if kind == "black" else 33), :3] = 4
+        Image.fromarray(rgba).save(tmp_path / f"{frame}.png")
+    video_clip(tmp_path, VideoOptions(size=64))
+    assert ("colors fade to black with the alpha in 2 frames" in capfd.readouterr().err) == (kind == "premultiplied")
+
+
 def test_keep_takes_the_whole_picture(tmp_path):
     busy = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
     found = read(video_clip(save(tmp_path / "c", [busy] * 2), VideoOptions(size=64, background="keep", recenter=False)))

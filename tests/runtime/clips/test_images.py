@@ -100,6 +100,16 @@ def test_gray_of_any_type_has_its_own_range(tmp_path, capsys, gray):
     assert ("is taken for 0 to 255" in capsys.readouterr().err) == (gray.dtype == np.uint16 and gray < 256)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_level_of_gray_that_is_see_through_is(tmp_path, dtype):
+    """The chunk tRNS of PNG, which Pillow follows in 8 bits alone."""
+    levels = np.full((8, 8), 40 if dtype == np.uint8 else 40 * 257, dtype)
+    levels[2:] = 102 * (1 if dtype == np.uint8 else 257)
+    Image.fromarray(levels).save(tmp_path / "a.png", transparency=int(levels[0, 0]))
+    read = read_rgba(tmp_path / "a.png")
+    assert read[0, 0, 3] == 0 and read[4, 4].tolist() == [102, 102, 102, 255]
+
+
 @pytest.mark.parametrize(
     "names",
     [

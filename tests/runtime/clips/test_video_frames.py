@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import struct
 import subprocess
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
@@ -196,6 +198,59 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     tags = ("-colorspace", matrix, "-color_range", kind)
     film(tmp_path, tmp_path / "c.mp4", *PLAIN, "-vf", scale, *tags)
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
+
+
+WEIGHTS = {
+    1: (0.2126, 0.0722),
+    5: (0.299, 0.114),
+    9: (0.2627, 0.0593),
+}  # of red and blue in brightness, by H.273's matrices
+PATCHES = np.array(
+    [[255, 255, 255], [0, 0, 0], [128, 128, 128], [255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [250, 240, 230]]
+    + [
+        [0, 255, 255],
+        [255, 0, 255],
+        [17, 200, 90],
+        [200, 17, 90],
+        [90, 30, 220],
+        [5, 10, 15],
+        [64, 32, 16],
+        [180, 160, 140],
+    ]
+)
+
+
+@pytest.mark.parametrize("shrunk", [(2, 2), (2, 1), (1, 1), (1, 2)])
+@pytest.mark.parametrize("bits", [8, 10, 12])
+@pytest.mark.parametrize("matrix", WEIGHTS)
+@pytest.mark.parametrize("full", [False, True])
+def test_stored_brightness_and_colors_become_the_levels_of_the_standard(tmp_path, shrunk, bits, matrix, full):
+    """Flat patches of 16 pixels in YCbCr, by the formulas of H.273, without loss; 8 bits round by a level."""
+    red, blue = WEIGHTS[matrix]
+    r, g, b = PATCHES.T / 255
+    luma = red * r + (1 - red - blue) * g + blue * b
+    chroma = [(b - luma) / (2 - 2 * blue), (r - luma) / (2 - 2 * red)]
+    top, step = 2**bits - 1, 2 ** (bits - 8)
+    levels = [luma * top if full else (16 + 219 * luma) * step]
+    levels += [one * (top if full else 224 * step) + 128 * step for one in chroma]
+    kind = {(2, 2): "420", (2, 1): "422", (1, 1): "444", (1, 2): "440"}[shrunk]
+    pixels = f"yuv{kind}p" + (f"{bits}le" if bits > 8 else "")
+    place = np.kron(np.arange(16).reshape(4, 4), np.ones((16, 16), int))
+    frame = av.VideoFrame(64, 64, pixels)
+    frame.pts, frame.time_base, frame.colorspace, frame.color_range = 0, Fraction(1, 10), matrix, 2 if full else 1
+    for plane, values, (across, down) in zip(frame.planes, levels, ((1, 1), shrunk, shrunk)):
+        stored = values.round().clip(0, top)[place][::down, ::across].astype(np.uint8 if bits == 8 else np.uint16)
+        lines = np.zeros((plane.height, plane.line_size // stored.itemsize), stored.dtype)
+        lines[:, : stored.shape[1]] = stored
+        plane.update(lines.tobytes())
+    with av.open(str(tmp_path / "c.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, pixels
+        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, 2 if full else 1
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    shown = decoded(tmp_path / "c.mkv")[0, 8::16, 8::16, :3].reshape(-1, 3)
+    assert np.abs(shown.astype(int) - PATCHES).max() <= (3 if bits == 8 else 2)
 
 
 def with_box(mp4: bytes, box: bytes, depth: int = 7) -> bytes:
