@@ -46,7 +46,7 @@ class Confidence:
         return powers / powers.sum(-1, keepdims=True)
 
     def notes(self) -> dict[str, Any]:
-        """Returns it as a weights file's notes hold it."""
+        """Returns the fields by name, as the notes of a weights file hold them."""
         return asdict(self)
 
 

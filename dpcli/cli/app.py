@@ -29,7 +29,7 @@ tune_environment()  # before torch and numba load
 ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
     "classify": "Recognize actions and gestures (Kinet).",
-    "segment": "Find rigid parts and their motions in a few frames, without labels.",
+    "segment": "Find rigid parts, their motions and joints, without labels.",
     "generate4d": "Fit, draw and export a 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
     "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; also as a contact sheet or a page.",

@@ -21,7 +21,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def memory_sentence(error: BaseException) -> str:
-    """Returns what is said where no number of the user's explains it."""
+    """Returns the message for a command that ran out of memory though no number given to it is large."""
     return (
         f"not enough memory on {_machine(error)}{_asked_for(error)}; take less at a time: --batch, or --set accumulate=2 in"
         " `classify train`, --points, --frames, --size, --jobs"

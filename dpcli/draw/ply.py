@@ -17,20 +17,18 @@ _VERTEX = np.dtype(
 _NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<i4": "int"}
 
 
-def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: np.ndarray) -> None:
-    """Writes one frame of points f32 or f64 (N,3), which stay so, colors u8 (N,3) (None: by part), part ids (N).
+def write_ply(path: Path, points: np.ndarray, part: np.ndarray) -> None:
+    """Writes one frame of points f32 or f64 (N,3), which stay so, colored by their part ids (N), an int property `part`.
 
-    The ids are an int property `part`.
     Binary, little-endian, PLY 1.0 (Turk 1994). Raises DataError on shapes that don't fit, or when it can't be written.
     """
-    colors = part_colors(part) if colors is None else colors
     count = len(points)
-    if points.shape != (count, 3) or colors.shape != (count, 3) or part.shape != (count,):
-        raise DataError(f"{path}: points {points.shape}, colors {colors.shape} and part {part.shape} don't fit")
+    if points.shape != (count, 3) or part.shape != (count,):
+        raise DataError(f"{path}: points {points.shape} and part {part.shape} don't fit")
     wide = "<f8" if points.dtype == np.float64 else "<f4"
     vertex = np.dtype([(name, wide if name in "xyz" else _VERTEX[name]) for name in _VERTEX.names])
     rows = np.empty(count, vertex)
-    for column, values in zip(vertex.names, [*points.T, *colors.T, part], strict=True):
+    for column, values in zip(vertex.names, [*points.T, *part_colors(part).T, part], strict=True):
         rows[column] = values
     properties = [f"property {_NAMES[vertex[name].str]} {name}" for name in vertex.names]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
@@ -54,5 +52,5 @@ def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
         paths.append(folder / f"{t:04d}.ply")
         points = sequence.points[span]
         points = points if sequence.shift is None else points.astype(np.float64) + sequence.shift
-        write_ply(paths[-1], points, None, sequence.part[span])
+        write_ply(paths[-1], points, sequence.part[span])
     return paths

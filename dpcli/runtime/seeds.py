@@ -21,7 +21,7 @@ class PrepareStream(IntEnum):
     SPLIT = 5005  # which samples go to which split; key: the stratum
     OBJECT_SPLIT = 1 << 28  # which objects go to which split
     OBJECT_STUDY = 1 << 29  # poses in which an object is looked at, to find joints that move nothing
-    SHAPE_PICTURES = 1 << 27  # models that a shape prior learns from, in their poses; key: the round
+    SHAPE_PICTURES = 1 << 27  # models that a shape network learns from, in their poses; key: the round
     SHAPE_VIEWS = SHAPE_PICTURES + 1  # how they are drawn; key: the round
     MADE = 1 << 30  # a made subject (gestures) or object (articulated); key: its number
 
@@ -55,7 +55,7 @@ class Generate4DStream(IntEnum):
     FIRST_POINTS = 4001  # where the first Gaussians are
     FIRST_WEIGHTS = 4002  # the first weights of what is learned beside them
     STEP = 4003  # views, frames and cameras of a step; key: the step
-    SHAPE_WEIGHTS = 4101  # the first weights of a shape prior
+    SHAPE_WEIGHTS = 4101  # the first weights of a shape network
     SHAPE_STEP = 4102  # pictures of a step of its training; key: the step
 
 

@@ -65,7 +65,7 @@ class _MemoryFiles:
         self._process = 0
 
     def take(self) -> _MemoryFile | None:
-        """Returns one that is not being read; None when there are too many."""
+        """Returns a memory file that nobody reads, a new one where all are read; None when there are too many."""
         if self._process != os.getpid():  # after a fork they are another's
             self._files, self._process = [], os.getpid()
         free = [file for file in self._files if not file.in_use()]

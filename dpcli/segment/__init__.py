@@ -1,1 +1,1 @@
-"""This room holds multi-body SE(3) equivariance (thesis chapter 4): rigid parts and their motions in a few frames, without labels."""
+"""This room holds multi-body SE(3) equivariance (thesis chapter 4): rigid parts, their motions and joints, without labels."""

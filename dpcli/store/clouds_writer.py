@@ -120,7 +120,7 @@ class CloudsWriter(ResumableWriter):
         self._names.add(sequence.name)
 
     def write_again(self, given: list[Any]) -> str:
-        """Writes a sample as `_record` was told of it, and returns its name."""
+        """Writes a sample from the values that `_record` is given for it, and returns its name."""
         self.write(*given)
         return given[0].name
 

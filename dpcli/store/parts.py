@@ -24,7 +24,7 @@ _FIELD = fields_of("parts")
 
 @dataclass
 class PartsSample:
-    """Holds what is said of one sequence, beside the hard ids in its `part`.
+    """Holds what was predicted for one sequence beside the part id of each point, which is the sequence's `part`.
 
     probability f32 (P,K) of each part, 0..1; pairs i32 (Q,2) source and target frame; motion f32 (Q,K,4,4) with
     x_target = R x_source + t; flow: for each pair f32 (N_source,3), the displacement of the source frame's points.
@@ -175,7 +175,7 @@ class PartsWriter(CloudsWriter):
 
 
 class PartsReader(CloudsReader):
-    """Reads a `parts` file as CloudsReader does; `read_parts` reads what is said of one sequence. `num_parts` = K.
+    """Reads a `parts` file as CloudsReader does; `read_parts` reads what was predicted for one sequence. `num_parts` = K.
 
     The layout is checked on opening, the values of a sequence when it is read: DataError.
     """

@@ -102,7 +102,7 @@ class ScoresWriter(ResumableWriter):
         return super()._about() | {"streams": list(self.streams), "rejects": self.rejects}
 
     def write_again(self, given: list[Any]) -> str:
-        """Writes a sample as `_record` was told of it, and returns its name."""
+        """Writes a sample from the values that `_record` is given for it, and returns its name."""
         name, split, label, scores, single, rejected = given
         self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)), rejected=rejected)
         return name

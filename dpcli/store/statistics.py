@@ -40,7 +40,7 @@ class StatisticsWriter(ResumableWriter):
         self.write_again([name, json.dumps(_packed(values), sort_keys=True)])
 
     def write_again(self, given: list[Any]) -> str:
-        """Writes a sample as `_record` was told of it, and returns its name."""
+        """Writes a sample from the values that `_record` is given for it, and returns its name."""
         name, text = given
         self._names.append(name)
         self._texts.append(text)

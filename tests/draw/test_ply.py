@@ -27,11 +27,10 @@ def test_ply_is_what_open3d_reads(tmp_path: Path) -> None:
         np.testing.assert_array_equal(cloud["part"].numpy()[:, 0], sequence.part[span])
 
 
-def test_ply_keeps_given_colors_and_unknown_parts(tmp_path: Path) -> None:
-    points, colors = np.eye(3, dtype=np.float32), np.arange(9, dtype=np.uint8).reshape(3, 3)
-    write_ply(tmp_path / "a.ply", points, colors, np.array([-1, 0, 300]))
+def test_ply_keeps_unknown_and_large_parts(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", np.eye(3, dtype=np.float32), np.array([-1, 0, 300]))
     raw = (tmp_path / "a.ply").read_bytes()
     header, _, body = raw.partition(b"end_header\n")
     assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n") and len(body) == 3 * 19
     assert np.frombuffer(body[-4:], "<i4")[0] == 300 and np.frombuffer(body[15:19], "<i4")[0] == -1
-    assert list(body[12:15]) == [0, 1, 2]
+    assert list(body[12:15]) == part_colors(np.array([-1]))[0].tolist()

@@ -90,11 +90,11 @@ def test_pictures_say_what_is_wrong(sequence: CloudSequence, tmp_path: Path) -> 
         (UsageError, "expected .gif", lambda: turntable(tmp_path / "a.mp4", sequence)),
         (UsageError, "up axis 'w'", lambda: Look(up="w")),
         (DataError, "no parts to write", lambda: write_ply_frames(tmp_path / "ply", bare)),
-        (DataError, "don't fit", lambda: write_ply(tmp_path / "a.ply", np.zeros((2, 3)), None, np.zeros(3, int))),
+        (DataError, "don't fit", lambda: write_ply(tmp_path / "a.ply", np.zeros((2, 3)), np.zeros(3, int))),
         (
             DataError,
             "existing folder",
-            lambda: write_ply(tmp_path / "no" / "a.ply", np.zeros((1, 3)), None, np.zeros(1, int)),
+            lambda: write_ply(tmp_path / "no" / "a.ply", np.zeros((1, 3)), np.zeros(1, int)),
         ),
     ]
     for kind, message, call in cases:

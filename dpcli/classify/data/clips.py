@@ -184,7 +184,9 @@ class ClipSource:
         return Clip(sequence, tuple(shown[step] for step in steps))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
-        """Returns the clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
+        """Returns the clip's points f32 (T,P,3), for timing slots (T,P,5+F) as `PointSlots` takes them; `key` (an epoch and a
+        position, say) seeds the choice of points and the augmentation.
+        """
         rng = generator(self.seed, ClassifyStream.POINTS, *key)
         if self.timing == "slots":
             return self._slots(clip, rng)

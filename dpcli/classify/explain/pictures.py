@@ -131,7 +131,7 @@ def plane_picture(
         if unknown.any():
             handles.append(axes.scatter(*xy[unknown].T, s=16, color="0.65", linewidths=0))
         for place, label in enumerate(present):
-            color, marker = _style(place, len(present))
+            color, marker = _style(place)
             handles.append(axes.scatter(*xy[labels == label].T, s=22, color=[color], marker=marker, linewidths=0))
         axes.set_title(f"{stream}\n{captions[stream]}", fontsize=10)
         axes.set(xticks=[], yticks=[])
@@ -146,7 +146,7 @@ def plane_picture(
     save_figure(figure, path, 130)
 
 
-def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:
+def _style(place: int) -> tuple[tuple[float, ...], str]:
     """Returns color and marker of a class, ten hues a marker (20 classes: circles, squares), so that neighbors differ."""
     from matplotlib import colormaps
 

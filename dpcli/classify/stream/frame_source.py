@@ -147,7 +147,7 @@ def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], 
         _check_whole(source, where)
         raise DataError(f"{where}: damaged .npy header ({error}); {_RECIPE}") from None
     if len(shape) != 2 or shape[1] < 3 or dtype.kind not in "uif":
-        raise DataError(f"{where}: array of shape {shape}, {dtype}; expected one frame's float32 (points, 3)")
+        raise DataError(f"{where}: array of shape {shape}, {dtype}, not one frame's (points, 3); {_RECIPE}")
     if shape[0] == 3 and shape[1] > _MOST_NUMBERS:
         raise DataError(
             f"{where}: array of shape {shape}; expected a row for each point, (points, 3): send it transposed"

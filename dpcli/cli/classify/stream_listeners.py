@@ -40,7 +40,7 @@ class Several:
 
 
 def listener(speaker: Speaker, as_json: bool, page: Path | None, source: str) -> Several:
-    """Returns those who listen: a view on a terminal, else lines; and the page's writer."""
+    """Returns what shows the predictions of a stream: a view on a terminal, else lines; and the writer of a page, if asked for."""
     lines = Lines(speaker, as_json)
     in_place = sys.stdout.isatty() and os.environ.get("TERM") != "dumb" and not as_json
     several: list[Listener] = [View(speaker, lines) if in_place else lines]

@@ -33,7 +33,7 @@ def train_prior(
     device: Device = "auto",
     force: Force = False,
 ) -> None:
-    """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures and things.
+    """Train the shape network of `fit` on pictures of models, moving and still, and of made-up creatures and things.
 
     Running again continues.
     """

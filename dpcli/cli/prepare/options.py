@@ -69,8 +69,8 @@ CategoryFractions = Annotated[
 SequencesPerObject = Annotated[
     int,
     typer.Option(
-        "--pairs-per-object",
         "--sequences-per-object",
+        "--pairs-per-object",
         min=1,
         max=100_000,
         help="Sequences of --frames drawn of each object.",

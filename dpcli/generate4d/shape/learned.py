@@ -1,4 +1,4 @@
-"""The learned shape prior: a clip's pictures, cut out around the object, through the network, back to the camera's depths."""
+"""The shape network as a prior: a clip's pictures, cut out around the object, through the network, back to the camera's depths."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ class MSRAction3D:
             match = NAME.fullmatch(path.name)
             if not match:
                 continue
-            item = self._item(path, *(int(v) for v in match.groups()[:3]))
+            item = self._item(path, *(int(v) for v in match.groups()[:2]))
             first = found.setdefault(item.name, item).path
             # .bin sorts before .mat: where both are present the official form wins
             if first.suffix.lower() == path.suffix.lower() and not first.samefile(path):
@@ -172,7 +172,7 @@ class MSRAction3D:
             raise DataError(f"{folder}: no {expected} in it or below")
         return [found[name] for name in sorted(found)]
 
-    def _item(self, path: Path, action: int, subject: int, trial: int) -> Item:
+    def _item(self, path: Path, action: int, subject: int) -> Item:
         problem = ""
         if not 1 <= action <= len(CLASS_NAMES):
             problem = f"{path}: action {action} in the file name is out of range; expected 1 to {len(CLASS_NAMES)}"

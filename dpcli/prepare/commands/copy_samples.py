@@ -40,7 +40,7 @@ def copy_samples(copy: Copy, read: Callable[[int], CloudSequence]) -> None:
     Raises UsageError when a stopped run left other samples for this output, and Stopped after a stop signal.
     """
     total = len(copy.names)
-    with stop_requested() as stop, _open_writer(copy) as writer, Progress(copy.task, total=total, unit="video") as bar:
+    with stop_requested() as stop, _open_writer(copy) as writer, Progress(copy.task, total=total, unit="sample") as bar:
         done = _copied_before(writer, copy.names)
         bar.skip(done)
         for place in range(done, total):

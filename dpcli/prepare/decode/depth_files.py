@@ -89,25 +89,15 @@ def _opened(path: Path):  # -> cv2.VideoCapture
     return capture
 
 
-def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: int = 1) -> Iterator[np.ndarray]:
-    """Yields frames start, start + stride, ... before ``stop``, each (H,W) u8 or u16; ends early where the file ends.
+def read_video(path: Path, start: int = 0, stop: int | None = None) -> tuple[list[np.ndarray], float | None]:
+    """Returns frames ``start`` to ``stop`` - 1, or those that the file has of them, each (H,W) u8 or u16, and the frames
+    per second that the file declares (None = says nothing).
 
     Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
     """
     capture = open_video(path)
     try:
-        yield from _decoded(capture, path, start, stop, stride)
-    finally:
-        capture.release()
-
-
-def read_video(
-    path: Path, start: int = 0, stop: int | None = None, stride: int = 1
-) -> tuple[list[np.ndarray], float | None]:
-    """Returns what `video_frames` yields, and the frames per second that the file declares (None = says nothing)."""
-    capture = open_video(path)
-    try:
-        return list(_decoded(capture, path, start, stop, stride)), _declared_rate(capture)
+        return list(_decoded(capture, path, start, stop, 1)), _declared_rate(capture)
     finally:
         capture.release()
 

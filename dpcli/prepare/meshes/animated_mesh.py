@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,7 +72,6 @@ class AnimatedMesh:
     weights: np.ndarray
     bone_pose: np.ndarray
     bone_parent: np.ndarray
-    bone_name: tuple[str, ...] = field(default=())
     emission_uv: np.ndarray | None = None
     one_sided: np.ndarray | None = None
     faceted: np.ndarray | None = None

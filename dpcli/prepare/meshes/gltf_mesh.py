@@ -96,7 +96,6 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         weights=joined("weights", joints),
         bone_pose=_hidden_apart(pieces, poses, shown),
         bone_parent=parent,
-        bone_name=tuple(node_name(file, index) for index in range(len(parent))),
         emission_uv=joined("emission_uv"),
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]

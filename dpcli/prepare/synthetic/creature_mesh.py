@@ -47,7 +47,6 @@ def animated_creature(animal: Creature, body: Skin, pose: np.ndarray, *, name: s
         weights=body.weights,
         bone_pose=pose,
         bone_parent=np.array([bone.parent for bone in animal.bones]),
-        bone_name=tuple(bone.name for bone in animal.bones),
     )
 
 

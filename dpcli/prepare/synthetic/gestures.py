@@ -132,7 +132,7 @@ class SyntheticGestures:
 
     @property
     def train_subjects(self) -> int:
-        """Returns how many subjects, from 1 on, train; the others that are seen test: six of ten."""
+        """Returns the number of subjects, from 1 on, whose videos are for training: six of ten of those seen; the others test."""
         return max(1, min(self.seen_subjects - 1, round(0.6 * self.seen_subjects)))
 
     def items(self) -> list[Item]:

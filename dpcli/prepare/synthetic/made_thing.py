@@ -1,4 +1,4 @@
-"""Made-up things for the training of a shape prior: procedural furniture, tools and machines, and heaps of simple solids."""
+"""Made-up things for the training of a shape network: procedural furniture, tools and machines, and heaps of simple solids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rounds of pictures with layers for the training of a shape prior: of models, moving or still, and of what is made up.
+"""Rounds of pictures with layers for the training of a shape network: of models, moving or still, and of what is made up.
 
 A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen. Its
 models are read and posed by one process and may be drawn by another, which has a GPU.

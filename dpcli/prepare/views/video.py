@@ -185,7 +185,7 @@ class Cutter:
 def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
     """Returns how to cut, which frames, the one crop of them all, and the (width, height) of the source."""
     wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
-    warn_gaps(frames, wanted)
+    warn_gaps(frames)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty, apart, dark, whole = [], [], [], [], [], [], 0
     for index, rgba in zip(wanted, cutter.cut(wanted)):
@@ -280,7 +280,7 @@ def _require_one_size(frames: Frames, wanted: list[int], sizes: list[tuple[int, 
             )
 
 
-def warn_gaps(frames: Frames, wanted: list[int]) -> None:
+def warn_gaps(frames: Frames) -> None:
     """Says in the log where the numbers of frames jump, unless their times are known, which show it."""
     if frames.times is not None:
         return

@@ -115,7 +115,7 @@ class ClipIndex:
         if self.options.mask:
             find_masks(frames, self.options.mask)
         find_given_views(frames, spread_frames(len(frames), self.options.frames), self.options)
-        warn_gaps(frames, list(range(len(frames))))
+        warn_gaps(frames)
         if not self.clip.is_dir():
             return [Item(name, self.clip) for name in frames.names]
         return list(_frame_items(frames))

@@ -19,7 +19,7 @@ class OncePerProcess(Generic[Made]):
         self._make, self._mark, self._own = make, mark, made
 
     def get(self) -> Made:
-        """Returns it, made now if this process has none."""
+        """Returns what `make()` returned in this process, which is called at the first time."""
         if self._own is not None:
             return self._own
         if self._mark not in _made:

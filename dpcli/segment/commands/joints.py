@@ -47,9 +47,9 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
         trees = _trees(reader, chosen, counts, picture)
         if str(output) == "-":
             with output_file("-") as target:
-                _write_parts(trees, target, reader, path, force)
+                _write_parts(trees, target, reader, force)
         else:
-            _WRITERS.get(suffix, _write_folder)(trees, output, reader, path, force)
+            _WRITERS.get(suffix, _write_folder)(trees, output, reader, force)
     return counts
 
 
@@ -85,16 +85,16 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
         )
 
 
-def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+def _write_parts(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
     """Writes the parts file again, with the joints as a further field."""
     fields = [name for name in reader.fields if name != "joint"]
-    history = [*reader.provenance, provenance.record({}, 0, {"parts": path})]
+    history = [*reader.provenance, provenance.record({}, 0, {"parts": reader.path})]
     with PartsWriter(
         output,
         num_parts=reader.num_parts,
         class_names=reader.class_names,
         length_unit=reader.length_unit,
-        source=path.name,
+        source=reader.path.name,
         provenance=history,
         fields=[*fields, "joint"],
         force=force,
@@ -105,17 +105,17 @@ def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, fo
             writer.write(sequence, said.probability, said.pairs, said.motion, said.flow)
 
 
-def _write_urdf(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+def _write_urdf(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
     for _, sequence, tree in trees:
         write_urdf(output, tree, sequence.name, reader.length_unit)
         log.info(f"{output}: {len(tree.points)} links; meshes in {output.stem}_meshes")
 
 
-def _write_json(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+def _write_json(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
     write_trees(output, [tree_json(tree, sequence.name, reader.length_unit) for _, sequence, tree in trees])
 
 
-def _write_folder(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+def _write_folder(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
     if output.suffix:
         raise UsageError(f"-o {output}: expected a name that ends in {', '.join(SUFFIXES)}, or a folder")
     if output.exists():  # replaced by --force, which keeps what else is there
@@ -135,7 +135,7 @@ def _fill_folder(folder: Path, trees: Trees, reader: PartsReader) -> None:
     write_trees(folder / "joints.json", objects)
 
 
-_WRITERS: dict[str, Callable[[Trees, Path, PartsReader, Path, bool], None]] = {
+_WRITERS: dict[str, Callable[[Trees, Path, PartsReader, bool], None]] = {
     ".h5": _write_parts,
     ".urdf": _write_urdf,
     ".json": _write_json,

@@ -23,7 +23,7 @@ _LEVEL = np.cos(np.radians(15))  # an axis of the file this near to that of the 
 _ALL_AROUND = 0.6  # share of the second least spread of the beams' directions above which they turn about no axis
 
 
-def find_up(points: np.ndarray, sensor: np.ndarray | None, seed: int = 0) -> tuple[np.ndarray, bool]:
+def find_up(points: np.ndarray, sensor: np.ndarray | None) -> tuple[np.ndarray, bool]:
     """Returns the unit vector f64 (3) that points up, and whether a ground plane showed it.
 
     points: f64 (N,3), meters. Planes are found one after the other by RANSAC; the ground is a large one with hardly
@@ -31,7 +31,7 @@ def find_up(points: np.ndarray, sensor: np.ndarray | None, seed: int = 0) -> tup
     sensor turn, or else the file's axis along which a scene extends least.
     """
     open3d = load_open3d()
-    open3d.utility.random.seed(seed)
+    open3d.utility.random.seed(0)
     rest = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)).voxel_down_sample(0.3)
     thin = np.asarray(rest.points)
     extent = np.ptp(np.percentile(thin, (2, 98), axis=0), axis=0)

@@ -93,7 +93,7 @@ class Trainer:
         self.model.train()
         started = time.monotonic()
         steps, rate = self._steps(), 0.0
-        chosen = self._epoch_pairs(steps)
+        chosen = self._epoch_pairs()
         while self.step < steps:
             pairs = list(islice(chosen, self.schedule.batch))
             rate = self._step(pairs, self.epoch * steps + self.step, steps * self.schedule.epochs)
@@ -108,7 +108,7 @@ class Trainer:
             self.stop.check(f"saved at epoch {self.epoch + 1}, step {self.step}")
         self._end_epoch(rate, started)
 
-    def _epoch_pairs(self, steps: int) -> Iterator[Pair]:
+    def _epoch_pairs(self) -> Iterator[Pair]:
         """Yields the epoch's pairs from `self.step` on; while the cold start lasts, only those whose flow shows bodies.
 
         The others, half of them or more in slow scenes, show one body, from which the cold start learns nothing.

@@ -78,7 +78,7 @@ class ResumableWriter(ABC):
 
     @abstractmethod
     def write_again(self, given: list[Any]) -> str:
-        """Writes a sample as `_record` was told of it, and returns its name."""
+        """Writes a sample from the values that `_record` is given for it, and returns its name."""
 
     @abstractmethod
     def _complete(self) -> None:

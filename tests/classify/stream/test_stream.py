@@ -252,7 +252,7 @@ BAD = {
     "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(90), "leave out --stream"),
     "text": (b"0.1 0.2 0.3\n" * 9, "not a .npy array"),
     "one axis": (npy(np.ones(6, np.float32)), r"shape \(6,\)"),
-    "a video": (npy(np.ones((2, 5, 3), np.float32)), "one frame's"),
+    "a video": (npy(np.ones((2, 5, 3), np.float32)), "one frame's .*written one after another"),
     "two columns": (npy(np.ones((5, 2), np.float32)), r"shape \(5, 2\)"),
     "transposed": (npy(np.ones((3, 500), np.float32)), "send it transposed"),
     "objects": (npy(np.array([[None] * 3], object), allow_pickle=True), "object"),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.depth import DepthVideos, background_depth
-from dpcli.prepare.decode.depth_files import read_depth_video, read_image, video_frames
+from dpcli.prepare.decode.depth_files import read_depth_video, read_image, read_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 from dpcli.prepare.labels import labels_of_folders, read_labels
 from dpcli.prepare.reader import Item
@@ -118,9 +118,9 @@ def test_a_video_of_a_color_map_is_no_depth_and_gray_ones_are(tmp_path):
             writer.release()
             if colored:
                 with pytest.raises(DataError, match=f"{name}: frame 0 is colored"):
-                    list(video_frames(tmp_path / name))
+                    read_video(tmp_path / name)
             else:
-                assert len(list(video_frames(tmp_path / name))) == 6
+                assert len(read_video(tmp_path / name)[0]) == 6
 
 
 def test_a_tiff_of_several_pages_is_refused(tmp_path):
@@ -381,7 +381,7 @@ def test_bad_images_are_named(tmp_path):
 def test_a_truncated_video_gives_the_frames_it_has(tmp_path):
     path = write_video(tmp_path / "v.avi", depth16(frames=20))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    found = list(video_frames(path))
+    found, _ = read_video(path)
     assert 0 < len(found) < 20
     np.testing.assert_array_equal(found[0], depth16(frames=20)[0])
 

@@ -23,7 +23,7 @@ class WarpingStatistics:
     """Holds sums over pairs of neighboring frames: what `warping_compute` divides.
 
     squared, absolute: of the prediction's errors over `values` numbers (pixels that both frames show, times 3 channels);
-    truth_squared, truth_absolute: of the truth's own, 0 where there is none. pixels: all, seen or not.
+    truth_squared, truth_absolute: of the truth's own. pixels: all, seen or not.
     """
 
     squared: float = 0.0
@@ -43,7 +43,7 @@ class WarpingStatistics:
 class WarpingMetrics:
     """Holds warping errors of colors in 0..1: mean squared (what the field reports) and absolute, and the truth's own.
 
-    occluded: share of the pixels left out. NaN = undefined: no pairs, no pixel seen twice, or no truth.
+    occluded: share of the pixels left out. NaN = undefined: no pairs, or no pixel seen twice.
     """
 
     squared: float
@@ -52,33 +52,29 @@ class WarpingMetrics:
     truth_absolute: float
     occluded: float
     pairs: int
-    flow_of: str
 
 
 class WarpingError:
     """Sums the warping error of a video while its frames stream in; holds the frame before.
 
     E = mean over the pixels seen in both frames of (x_t(p) - x_(t-1)(p + f(p)))^2 (Lai et al. 2018, eq. 6 and 7), f the
-    flow from frame t back to t - 1 of OpenCV's DIS on 8-bit gray pictures: of the truth, else of the prediction, which
-    then is judged by its own motion. A pixel counts as seen when its partner lies inside the picture and the flow back
-    and forth ends where it began: |f(p) + g(p + f(p))|^2 <= 0.01 (|f|^2 + |g|^2) + 0.5.
+    truth's flow from frame t back to t - 1, of OpenCV's DIS on 8-bit gray pictures. A pixel counts as seen when its
+    partner lies inside the picture and the flow back and forth ends where it began:
+    |f(p) + g(p + f(p))|^2 <= 0.01 (|f|^2 + |g|^2) + 0.5.
     """
 
     def __init__(self) -> None:
-        self._before: tuple[np.ndarray, np.ndarray | None, np.ndarray] | None = None
+        self._before: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found = WarpingStatistics()
-        self.flow_of = "prediction"
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray | None = None) -> None:
+    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
         """Takes the next frame f32 (3,H,W), 0..1. Raises DataError as `check_picture_values`, and for pictures under 16 pixels.
 
-        Raises ValueError for sizes that differ, and for a truth that comes and goes.
+        Raises ValueError where prediction and truth differ in size.
         """
         for picture in (predicted, truth):
-            if picture is not None:
-                _check(picture, predicted)
-        self.flow_of = "prediction" if truth is None else "truth"
-        gray = _gray(predicted if truth is None else truth)
+            _check(picture, predicted)
+        gray = _gray(truth)
         if self._before is not None:
             self._found += _compare_pair(self._before, (predicted, truth, gray))
         self._before = (predicted, truth, gray)
@@ -99,21 +95,19 @@ def warping_merge(parts: Iterable[WarpingStatistics]) -> WarpingStatistics:
     return reduce(WarpingStatistics.__add__, parts, WarpingStatistics())
 
 
-def warping_compute(found: WarpingStatistics, flow_of: str = "truth") -> WarpingMetrics:
-    """Returns the errors per value. flow_of: whose flow moved the frames; without a truth it has no errors."""
+def warping_compute(found: WarpingStatistics) -> WarpingMetrics:
+    """Returns the errors per value."""
     sums = (found.squared, found.absolute, found.truth_squared, found.truth_absolute)
-    errors = [float(divide(one, found.values)) for one in sums]
-    if flow_of != "truth":
-        errors[2:] = [float("nan")] * 2
+    errors = (float(divide(one, found.values)) for one in sums)
     hidden = float(divide(3 * found.pixels - found.values, 3 * found.pixels))
-    return WarpingMetrics(*errors, hidden, found.pairs, flow_of)
+    return WarpingMetrics(*errors, hidden, found.pairs)
 
 
-def _compare_pair(before: Sequence[np.ndarray | None], now: Sequence[np.ndarray | None]) -> WarpingStatistics:
+def _compare_pair(before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> WarpingStatistics:
     back, forth = optical_flow(now[2], before[2]), optical_flow(before[2], now[2])
     seen = seen_in_both(back, forth)
     squared, absolute = _errors(before[0], now[0], back, seen)
-    own = (0.0, 0.0) if now[1] is None else _errors(before[1], now[1], back, seen)
+    own = _errors(before[1], now[1], back, seen)
     return WarpingStatistics(squared, absolute, *own, 3 * int(seen.sum()), seen.size, 1)
 
 

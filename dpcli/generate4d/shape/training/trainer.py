@@ -12,7 +12,6 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from dpcli.generate4d.shape.model_file import save_shape_model
@@ -191,5 +190,5 @@ def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[st
         gained.append(gain_of(error, part))
     names = ("validation_loss", "validation_inflated", "validation_angle", "validation_length")
     means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned, longer)]
-    confidence = calibrate(torch.cat(claimed).cpu().numpy(), (torch.cat(gained) > 0).cpu().numpy().astype(np.float64))
+    confidence = calibrate(torch.cat(claimed).cpu().numpy(), (torch.cat(gained) > 0).cpu().numpy())
     return dict(zip(names, means)), confidence

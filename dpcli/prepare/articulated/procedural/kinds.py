@@ -160,9 +160,9 @@ def laptop(b: Builder, rng: Rng) -> None:
     b.hinge((0, d / 2, t / 2), X, -rng.uniform(110, 180), 0, screen)
 
 
-def _blade(rng: Rng, length: float, width: float, thick: float, toward: int) -> np.ndarray:
+def _blade(rng: Rng, length: float, width: float, thick: float) -> np.ndarray:
     back, tip = rng.uniform(0.3, 0.5) * width, rng.uniform(0.7, 1.0)
-    outline = [(0, -back), (length * tip, -back), (length, -back * toward), (length * 0.6, back), (0, back)]
+    outline = [(0, -back), (length * tip, -back), (length, -back), (length * 0.6, back), (0, back)]
     return plate(outline, thick)
 
 
@@ -174,7 +174,7 @@ def scissors(b: Builder, rng: Rng) -> None:
     for k, sign in enumerate((1, -1)):
         end = np.array([-grip, sign * rng.uniform(0.08, 0.15), 0])
         handle = ring(rng.uniform(0.06, 0.1), 0.02, end) if rings else rod(end * [1.3, 1.2, 1], end, 0.025)
-        blade = _blade(rng, length, width, thick, 1)
+        blade = _blade(rng, length, width, thick)
         blade = blade if sign > 0 else blade * [1, -1, 1]
         shift = np.array([0, 0, thick * (k - 0.5)])
         halves.append(np.concatenate([blade, rod(np.zeros(3), end, 0.02), handle]) + shift)
@@ -188,7 +188,7 @@ def knife(b: Builder, rng: Rng) -> None:
     thick = rng.uniform(0.03, 0.06)
     if rng.random() < 0.35:
         b.add(0, open_box((length, thick, width), 0.006, without="front"))
-        blade = turned(_blade(rng, length * 0.9, width * 0.7, 0.008, 1), X, 90)
+        blade = turned(_blade(rng, length * 0.9, width * 0.7, 0.008), X, 90)
         b.slide((-length / 2, 0, 0), X, 0.1 * length, length * rng.uniform(0.6, 0.9), blade)
         return
     b.add(
@@ -196,7 +196,7 @@ def knife(b: Builder, rng: Rng) -> None:
     )
     for k in range(int(rng.integers(1, 5))):
         end = 1 if k % 2 == 0 else -1
-        blade = _blade(rng, length * rng.uniform(0.6, 0.95), width * 0.8, 0.008, 1) * [-end, 1, 1]
+        blade = _blade(rng, length * rng.uniform(0.6, 0.95), width * 0.8, 0.008) * [-end, 1, 1]
         b.hinge((end * length * 0.45, 0, 0.01 * (k - 1.5)), Z * rng.choice([-1, 1]), 0, rng.uniform(120, 180), blade)
 
 
