@@ -261,8 +261,13 @@ def refuse_pipe(path: Path) -> None:
 
 
 def check_replaced(folder: Path, own: Sequence[str]) -> None:
-    """Raises UsageError where a folder that --force replaces whole holds what no name pattern of the command's own covers."""
+    """Raises UsageError where a folder that --force replaces whole holds what no name pattern of the command's own covers.
+
+    Also where it is the current one: whoever called from it would stand in a folder that was removed.
+    """
     if folder.is_dir():
+        if folder.samefile("."):
+            raise UsageError(f"{folder}: is the current folder, which can't be replaced; name a new one in it")
         others = [
             one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)
         ]

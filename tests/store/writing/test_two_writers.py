@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import UsageError
 from dpcli.runtime import whole_file as module
 from dpcli.runtime.whole_file import put_in_place, whole_file
 from dpcli.store.writing import atomic_file
@@ -158,3 +159,10 @@ def test_a_link_to_a_folder_is_written_through(tmp_path):
     _write_folder(tmp_path / "out", "de")
     assert (tmp_path / "out").is_symlink() and os.listdir(tmp_path / "far") == ["real"]
     assert sorted(os.listdir(tmp_path / "out")) == ["d", "e"]
+
+
+def test_the_current_folder_is_not_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in (".", str(tmp_path), f"../{tmp_path.name}"):
+        with pytest.raises(UsageError, match="is the current folder, which can't be replaced; name a new one in it"):
+            module.check_replaced(Path(name), ("*.png",))
