@@ -1,7 +1,8 @@
-"""Standard streams under odd conditions: closed, on a terminal that doesn't show every letter, or with texts that would command it."""
+"""Standard streams under odd conditions: closed, full, on a terminal that lacks letters, or with texts that would command it."""
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import sys
@@ -24,20 +25,20 @@ def ready_streams() -> None:
     """Makes what is printed to a closed stream go nowhere, and spells a letter that can't be shown; before anything is opened.
 
     A closed stdin stays None, so that its readers can tell. The number of a closed stream is occupied, else the next
-    file to be opened would get it, and with it all that is printed.
+    file to be opened would get it, and with it all that is printed. What stderr can't take is dropped: no message is worth
+    the work that it tells of.
     """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
-    for name, number in (("stdout", 1), ("stderr", 2)):
-        stream = getattr(sys, name)
-        if stream is None:
-            setattr(sys, name, open(number, "w", closefd=False))
-        else:
-            stream.reconfigure(errors="backslashreplace")
-        setattr(sys, name, PrintableStream(getattr(sys, name)))
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False)
+    else:
+        sys.stdout.reconfigure(errors="backslashreplace")
+    sys.stdout = PrintableStream(sys.stdout)
+    sys.stderr = PrintableStream(_error_stream(2, closefd=False))
 
 
 def quiet_libraries() -> None:
@@ -46,18 +47,32 @@ def quiet_libraries() -> None:
     They write to number 2, which from now on is the null device, also in programs that this process starts.
     """
     before = sys.stderr
-    kept = open(
-        os.dup(2),
-        "w",
-        buffering=1,
-        encoding=sys.__stderr__.encoding if sys.__stderr__ else "utf-8",
-        errors="backslashreplace",
-    )
-    sys.__stderr__ = kept
+    sys.__stderr__ = kept = _error_stream(os.dup(2))
     sys.stderr = PrintableStream(kept) if isinstance(before, PrintableStream) else kept
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os.close(nowhere)
+
+
+class _DroppingFile(io.FileIO):
+    """Drops what can't be written: the disk of a log is full, a terminal is gone, nobody reads the pipe. Waits for a slow reader."""
+
+    def write(self, data: Any) -> int:
+        import select
+
+        try:
+            while (count := super().write(data)) is None:  # a terminal that another program set not to block
+                select.select([], [self], [])
+        except OSError:
+            return len(data)
+        return count
+
+
+def _error_stream(number: int, closefd: bool = True) -> TextIO:
+    """Returns a text stream for messages on an open descriptor, which never fails."""
+    encoding = sys.__stderr__.encoding if sys.__stderr__ else "utf-8"
+    file = io.BufferedWriter(_DroppingFile(number, "w", closefd=closefd))
+    return io.TextIOWrapper(file, encoding=encoding, errors="backslashreplace", line_buffering=True)
 
 
 @contextmanager

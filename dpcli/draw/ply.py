@@ -8,8 +8,8 @@ import numpy as np
 
 from dpcli.draw.palette import part_colors
 from dpcli.draw.sequences import PointSequence
-from dpcli.errors import DataError
-from dpcli.runtime.whole_file import make_folder
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.whole_file import check_replaced, make_folder, whole_file, write_whole
 
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("part", "<i4")]
@@ -32,25 +32,27 @@ def write_ply(path: Path, points: np.ndarray, part: np.ndarray) -> None:
         rows[column] = values
     properties = [f"property {_NAMES[vertex[name].str]} {name}" for name in vertex.names]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
-    try:
-        path.write_bytes(("\n".join(header) + "\n").encode("ascii") + rows.tobytes())
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name an existing folder to write to") from None
+    write_whole(path, ("\n".join(header) + "\n").encode("ascii") + rows.tobytes())
 
 
 def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
-    """Writes every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made.
+    """Writes every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which appears whole.
 
-    A sequence that was shifted (maps) is written where the raw data have it, in float64.
+    Frames that an earlier run left there are replaced, also where they were more. A sequence that was shifted (maps) is written
+    where the raw data have it, in float64. Raises UsageError where a file is, or the folder holds other things.
     """
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to write; `dpc segment predict` finds them")
-    make_folder(folder, "--ply")
-    offsets, paths = sequence.frame_offsets, []
-    for t in range(sequence.num_frames):
-        span = slice(offsets[t], offsets[t + 1])
-        paths.append(folder / f"{t:04d}.ply")
-        points = sequence.points[span]
-        points = points if sequence.shift is None else points.astype(np.float64) + sequence.shift
-        write_ply(paths[-1], points, sequence.part[span])
-    return paths
+    if folder.is_file():
+        raise UsageError(f"--ply {folder}: is a file, expected a folder for the frames")
+    check_replaced(folder, ("[0-9]*.ply",))
+    make_folder(folder.parent, "--ply")
+    offsets, names = sequence.frame_offsets, [f"{t:04d}.ply" for t in range(sequence.num_frames)]
+    with whole_file(folder) as part:
+        make_folder(part, "--ply")
+        for t, name in enumerate(names):
+            span = slice(offsets[t], offsets[t + 1])
+            points = sequence.points[span]
+            points = points if sequence.shift is None else points.astype(np.float64) + sequence.shift
+            write_ply(part / name, points, sequence.part[span])
+    return [folder / name for name in names]

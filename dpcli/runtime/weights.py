@@ -6,7 +6,6 @@ Nothing is unpickled. Finding a file and reading its header need no torch.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from math import prod
@@ -19,7 +18,7 @@ from dpcli.path_names import utf8_path
 from dpcli.regular_files import why_unreadable
 from dpcli.runtime.settings.stored import from_json, json_value
 from dpcli.runtime.settings.value_types import numbers_in
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.whole_file import write_whole
 
 if TYPE_CHECKING:
     import torch
@@ -72,29 +71,25 @@ def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str
 
 
 def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:
-    """Writes weights whole or not at all. header: text by name; `format` tells readers what it is."""
-    from safetensors.torch import save_file
+    """Writes weights whole or not at all. header: text by name; `format` tells readers what it is.
+
+    Raises DataError when they can't be written, DiskFull where the disk is full.
+    """
+    from safetensors.torch import save
 
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with whole_file(path) as part:
-        save_file(whole, part, {"version": __version__, **header})
-        _sort_header(part)
-        umask = os.umask(0)
-        os.umask(umask)
-        part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
+    # not the library's own writing: it leaves a file of another name when it is killed, and has errors of its own
+    write_whole(path, _with_sorted_header(save(whole, {"version": __version__, **header})))
 
 
-def _sort_header(path: Path) -> None:
+def _with_sorted_header(content: bytes) -> bytes:
     """Makes equal weights and texts equal bytes: the library writes the texts in another order each time. A file begins with
     the length of its header, 8 bytes, and the header in JSON, perhaps with spaces behind it."""
-    with path.open("r+b") as file:
-        length = int.from_bytes(file.read(8), "little")
-        header = json.loads(file.read(length))
-        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-        if len(text) <= length:
-            file.seek(8)
-            file.write(text.ljust(length))
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return b"".join([content[:8], text.ljust(length), content[8 + length :]]) if len(text) <= length else content
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

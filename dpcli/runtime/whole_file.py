@@ -81,22 +81,41 @@ def reserve(file: int, size: int) -> None:
 
 def put_in_place(part: Path, path: Path) -> None:
     """Brings `part`, a finished file or folder, to the disk and renames it to `path`, which it replaces. OSError: it can't."""
-    if part.is_dir():
-        if path.is_dir():
-            shutil.rmtree(path)
-    else:
-        with open(part, "rb") as whole:
-            os.fsync(whole.fileno())
-    os.replace(part, path)
+    if not part.is_dir():
+        _sync(part)
+        os.replace(part, path)
+        return
+    for one in part.rglob("*"):
+        if one.is_file():
+            _sync(one)
+    old = path.with_name(f".{path.name}.{os.getpid()}.old{path.suffix}")
+    _remove(old)
+    if path.is_dir():  # no folder can be renamed over one that holds files, and a kill must not leave one half removed
+        os.replace(path, old)
+    try:
+        os.replace(part, path)
+    except OSError:
+        if old.exists():
+            os.replace(old, path)
+        raise
+    _remove(old)
+
+
+def _sync(path: Path) -> None:
+    with open(path, "rb") as whole:
+        os.fsync(whole.fileno())
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yields the name to write to instead of `path`: beside it, hidden, with its suffix; renamed to it when the block ends.
 
-    The block may make a folder of that name. When it fails, nothing of it stays, and what was under `path` does. The name is
-    this process's own: of several that write `path` at the same time, the last one wins. Raises DiskFull where the disk is full.
+    The block may make a folder of that name; in the place of a link to a folder it takes that folder's. When it fails, nothing
+    of it stays, and what was under `path` does. The name is this process's own: of several that write `path` at the same
+    time, the last one wins. Raises DiskFull where the disk is full.
     """
+    if path.is_dir():
+        path = Path(os.path.realpath(path))
     part = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
     check_regular(path)
     _remove(part)
@@ -123,7 +142,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 def _remove_killed(path: Path) -> None:
     """Removes what killed processes of this machine left of a file or folder that they were writing."""
-    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.part{re.escape(path.suffix)}")
+    name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.(part|old){re.escape(path.suffix)}")
     with suppress(OSError), os.scandir(path.absolute().parent) as beside:
         for one in beside:
             found = name.fullmatch(one.name)
@@ -242,8 +261,13 @@ def refuse_pipe(path: Path) -> None:
 
 
 def check_replaced(folder: Path, own: Sequence[str]) -> None:
-    """Raises UsageError where a folder that --force replaces whole holds what no name pattern of the command's own covers."""
+    """Raises UsageError where a folder that --force replaces whole holds what no name pattern of the command's own covers.
+
+    Also where it is the current one: whoever called from it would stand in a folder that was removed.
+    """
     if folder.is_dir():
+        if folder.samefile("."):
+            raise UsageError(f"{folder}: is the current folder, which can't be replaced; name a new one in it")
         others = [
             one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)
         ]

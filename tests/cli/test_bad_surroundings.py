@@ -403,6 +403,23 @@ def test_closed_streams_and_pipes_in_the_place_of_files(named, line, code, said)
     assert bool(said) == bool(done.stderr) and named.read_bytes() == before and "Exception" not in done.stderr
 
 
+@pytest.mark.parametrize("stderr", ["2>/dev/full", "2> >(exec <&-; sleep 9)"])
+@pytest.mark.parametrize("debug", ["", "--debug"])
+def test_messages_that_nobody_can_be_told_do_not_end_the_work(named, tmp_path, stderr, debug):
+    """The log is on a full disk, or nobody reads the pipe any more."""
+    for sample in "ab":
+        (tmp_path / "raw" / sample).mkdir(parents=True)
+        np.save(tmp_path / "raw" / sample / "0.npy", np.ones((3, 3), np.float32))
+    (tmp_path / "raw" / "b" / "1.npy").write_bytes(b"no array")  # is skipped, which is told
+    words = f"prepare clouds {tmp_path}/raw -o {tmp_path}/o.h5 --jobs 2 -v {debug}"
+    done = shell(f"exec {stderr}; sleep 0.2; DPC {words}", named)
+    assert done.returncode == 0 and os.listdir(tmp_path) in (["raw", "o.h5"], ["o.h5", "raw"]), done
+    with CloudsReader(tmp_path / "o.h5") as reader:
+        assert reader.names == ["a"] and [name for name, _ in reader.skipped] == ["b"]
+    done = shell(f"exec {stderr}; sleep 0.2; DPC info absent {debug}", named)
+    assert done.returncode == 3, done
+
+
 @pytest.mark.parametrize(
     "words", ["info F --page x.html", "evaluate report F -o x.html", "evaluate classification F --picture x.png"]
 )

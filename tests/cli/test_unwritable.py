@@ -327,3 +327,13 @@ def test_merge_and_split_go_through_pipes(tmp_path):
     (tmp_path / "whole.h5").write_bytes(divided)
     with CloudsReader(tmp_path / "whole.h5") as reader:
         assert len(reader) == 6 and set(reader.splits) == {"test"}
+
+
+def test_a_first_run_that_finds_no_room_at_all_does_not_speak_of_an_earlier_one(tmp_path, monkeypatch):
+    def full(self, *given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Journal, "append", full)
+    with pytest.raises(DiskFull, match="nothing was left under that name. Free space") as told:
+        CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1})
+    assert "earlier" not in str(told.value) and not os.listdir(tmp_path)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.runtime import device, pool, progress, provenance
 from dpcli.runtime.pool import LostWorker, ordered_map
 from dpcli.runtime.seeds import generator
@@ -170,6 +170,26 @@ def test_a_log_s_last_line_is_not_there_twice_and_slow_rates_are_no_zeros(monkey
 
 def test_durations():
     assert [progress.duration(s) for s in (5.9, 75, 3725)] == ["5s", "1m15s", "1h02m"]
+
+
+def test_weights_are_written_by_one_name_and_what_hinders_that_is_said(tmp_path, monkeypatch):
+    """A folder that was removed meanwhile; a kill in the middle, after which the next run tidies up."""
+    tensors, header = {"a": torch.arange(6.0).reshape(2, 3)}, {"format": "toy"}
+    with pytest.raises(DataError, match=r"gone/w.safetensors: the folder .*gone does not exist; create it first"):
+        save_weights(tmp_path / "gone" / "w.safetensors", tensors, header)
+
+    def killed(part, path):
+        names.extend(os.listdir(tmp_path))
+        raise KeyboardInterrupt
+
+    names: list[str] = []
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("dpcli.runtime.whole_file.put_in_place", killed)
+        save_weights(tmp_path / "w.safetensors", tensors, header)
+    assert len(names) == 1 and names[0].startswith(".w.safetensors.") and not os.listdir(tmp_path)
+    save_weights(tmp_path / "w.safetensors", tensors, header)
+    loaded, said = load_weights(tmp_path / "w.safetensors", "toy", "nobody")
+    assert torch.equal(loaded["a"], tensors["a"]) and said["format"] == "toy"
 
 
 def test_equal_weights_are_equal_bytes(tmp_path):

@@ -93,7 +93,7 @@ def test_pictures_say_what_is_wrong(sequence: CloudSequence, tmp_path: Path) -> 
         (DataError, "don't fit", lambda: write_ply(tmp_path / "a.ply", np.zeros((2, 3)), np.zeros(3, int))),
         (
             DataError,
-            "existing folder",
+            "does not exist; create it first",
             lambda: write_ply(tmp_path / "no" / "a.ply", np.zeros((1, 3)), np.zeros(1, int)),
         ),
     ]

@@ -60,11 +60,11 @@ def export_sequence(
     Players show a folder as a clip when it holds nothing but files of such names: see `tables_beside`. The folder appears
     whole. Raises UsageError when it exists and `force` is off, which would replace it.
     """
+    check_replaced(folder, ("frame*.ply", "frame*.splat", "frame*.spz", "cameras.json", "metrics.json"))
     for path in (folder, *tables_beside(folder)):
         refuse_replacing(path, force)
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
-    check_replaced(folder, ("frame*.ply", "frame*.splat", "frame*.spz", "cameras.json", "metrics.json"))
     width = max(4, len(str(scene.num_frames)))
     names = [f"frame{number:0{width}d}.{form}" for number in range(1, scene.num_frames + 1)]
     try:

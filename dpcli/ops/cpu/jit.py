@@ -143,3 +143,12 @@ def parallel_kernel(function: Callable) -> Callable:
 def piece_kernel(function: Callable) -> Callable:
     """Compiles as `parallel_kernel`, but serial and without the GIL: for work that plain threads share among them."""
     return _compiled(function, nogil=True, fastmath=_ARITHMETIC, error_model="numpy")
+
+
+def inlined_piece(function: Callable) -> Callable:
+    """Compiles a helper of other kernels as `piece_kernel`, into each of its callers.
+
+    Called instead, it would be compiled by itself and with each caller, and reordered in two ways: the process that compiles
+    runs the one, those that find the caller in the cache the other, whose sums differ in their last bits.
+    """
+    return _compiled(function, forceinline=True, nogil=True, fastmath=_ARITHMETIC, error_model="numpy")

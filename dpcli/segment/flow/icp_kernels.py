@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dpcli.ops.cpu.jit import kernel, piece_kernel
+from dpcli.ops.cpu.jit import inlined_piece, kernel
 from dpcli.ops.cpu.simd import WIDTH, lanes, load, store
 
 _BLOCK = 128  # distances whose least is found at once; the compiler vectorizes that for 128, not for 64
@@ -124,7 +124,7 @@ def _compose(motion, v, center):
                 motion[i, 3] += center[i] + v[3 + i]
 
 
-@piece_kernel
+@inlined_piece
 def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector):
     """Writes the lower triangle of a Gauss-Newton step's matrix (6,6) and its vector (6); returns the sum of weights.
 
@@ -180,7 +180,7 @@ def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, 
     return total
 
 
-@piece_kernel
+@inlined_piece
 def _move(source, motion, moved, rounded, center):
     """Moves source (3,n): into `moved` as f64, into `rounded` as f32; and computes the center (3)."""
     for k in range(3):

@@ -109,7 +109,8 @@ class ItemPass:
                         self._take(place, result, write, bar)
                         self._check(stop)
             except KeyboardInterrupt:
-                log.warn(f"interrupted; {self._kept()}; run again to continue")
+                kept = f"{self._kept()}; run again to continue" if self.writer.resume else "nothing was kept"  # a pipe
+                log.warn(f"interrupted; {kept}")
                 raise
             except Exception as error:
                 if isinstance(error, DpcError) or workers.executor is not None:

@@ -99,6 +99,7 @@ class ResumableWriter(ABC):
                 raise DpcError(f"{self.path}: cannot write (another dpc is writing it)") from None
             except OSError as error:
                 raise disk_full(self.path, error) or not_writable(self.path, error) from None
+        earlier = bool(before and before.data_name)  # of this very work; a new journal has a name from its begin on
         try:
             if before and before.other and not force:
                 raise self._kept_of(before.other, before.about)
@@ -108,7 +109,7 @@ class ResumableWriter(ABC):
             if before:
                 self._continue(before, force)
         except BaseException as error:
-            full = before and before.data_name and not force and disk_full(self.path, error, _STILL_KEPT)
+            full = earlier and not force and disk_full(self.path, error, _STILL_KEPT)
             self._give_up(before)
             try:
                 self._leave(type(error), error, None)

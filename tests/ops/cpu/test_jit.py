@@ -102,3 +102,30 @@ def test_the_digest_covers_what_kernels_take_from_other_files():
     plain = {PACKAGE / "errors.py", PACKAGE / "runtime/clips/images.py", PACKAGE / "segment/flow/motion_proposals.py"}
     files = [path for path in PACKAGE.rglob("*.py") if "from dpcli.ops.cpu.jit import" in path.read_text()]
     assert len(files) > 15 and set().union(*map(names_from, files)) - plain == {*jit._SHARED} - {Path(jit.__file__)}
+
+
+def _decorated(tree: ast.Module) -> dict[str, tuple[str, ast.FunctionDef]]:
+    found = [one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef)]
+    return {one.name: (mark.id, one) for one in found for mark in one.decorator_list if isinstance(mark, ast.Name)}
+
+
+def test_no_kernel_that_reorders_is_called_by_another_one():
+    """Such a helper has two compiled forms, and which one runs depends on whether this process compiled it: `inlined_piece`."""
+    kernels, called = {}, []
+    for path in PACKAGE.rglob("*.py"):
+        kernels |= {name: (mark, one) for name, (mark, one) in _decorated(ast.parse(path.read_text("utf-8"))).items()}
+    reordering = {name for name, (mark, _) in kernels.items() if mark in ("piece_kernel", "parallel_kernel")}
+    compiled = (
+        "kernel",
+        "piece_kernel",
+        "parallel_kernel",
+        "arithmetic_kernel",
+        "inlined",
+        "inlined_piece",
+        "_inlined",
+    )
+    for name, (mark, function) in kernels.items():
+        inside = [one.func for one in ast.walk(function) if isinstance(one, ast.Call)]
+        names = {one.id for one in inside if isinstance(one, ast.Name)} if mark in compiled else set()
+        called += [f"{name} calls {one}" for one in sorted(names & reordering)]
+    assert len(reordering) > 10 and not called, called

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +17,7 @@ from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
 from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.network.se3_conv import _activate, instance_norm
 from tests.support.ops_helpers import backend
+from tests.support.prepare_helpers import ROOT
 
 
 def sphere(count: int, seed: int) -> np.ndarray:
@@ -161,3 +166,29 @@ def test_a_linearized_step_is_the_step_that_icp_makes():
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     moved = np.concatenate([turn @ start[:, :3], (turn @ (start[:, 3] - center) + center + step[3:])[:, None]], 1)
     assert np.allclose(surface.icp(columns(points[:50]), start, 1, 0.05, 0.05), moved, atol=1e-5)
+
+
+TWICE = """
+import hashlib
+import numpy as np
+from dpcli.segment.flow.surface_icp import Surface, columns
+
+rng = np.random.default_rng(0)
+for k in range(10):
+    cloud = (rng.normal(size=(rng.integers(40, 200), 3)) * 0.2).astype(np.float32)
+    surface, source = Surface(cloud), columns(cloud[::2])
+    motions = np.eye(4)[:3] + rng.normal(size=(8, 3, 4)) * 0.02
+    told = [surface.icp(source, motions[0], 8, 0.05, 0.02), *surface.icp_many(source, motions, 6, 0.05, 0.02, 0.3, 0.02)]
+    told += [*surface.linearize(source, motions[0], 0.05), surface.residuals(source, motions[0], 0.3)]
+    print(*(hashlib.sha256(one.tobytes()).hexdigest() for one in told))
+"""
+
+
+def test_the_process_that_compiles_computes_the_bits_of_those_that_find_the_code(tmp_path):
+    """What a first run after an installation writes is what any later run writes."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run([sys.executable, "-c", TWICE], env=environment, capture_output=True, text=True) for _ in range(2)
+    )
+    assert "compiling" in first.stderr and not second.stderr, (first.stderr, second.stderr)
+    assert len(first.stdout.split()) == 70 and first.stdout == second.stdout

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from dpcli.errors import Stopped
@@ -40,3 +42,27 @@ def test_an_item_lost_before_a_stop_is_passed_over_after_it(tmp_path):
     ((name, reason),) = one_pass(lambda place: place, -1)
     assert name == "b" and "--force starts over" in reason
     assert StatisticsReader(tmp_path / "a.h5").names == ["a", "c", "d"]
+
+
+@pytest.mark.parametrize(
+    ("resume", "said"), [(True, "1 of 4 items are kept; run again to continue"), (False, "nothing was kept")]
+)
+def test_an_interrupt_says_what_is_kept_which_in_a_pipe_is_nothing(resume, said, tmp_path, capsys):
+    def work(place: int) -> int:
+        if place == 1:
+            raise KeyboardInterrupt
+        return place
+
+    with (
+        pytest.raises(KeyboardInterrupt),
+        StatisticsWriter(tmp_path / "a.h5", class_names=["a"], provenance=[{"config": {}}], resume=resume) as writer,
+    ):
+        write = partial(_write, writer)
+        ItemPass(writer, NAMES, Wording("test", "item", "counted")).run(work, lambda place: place, write, Workers())
+    assert f"dpc: warning: interrupted; {said}\n" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ([".a.h5.new", ".a.h5.part"] if resume else [])
+
+
+def _write(writer: StatisticsWriter, place: int, value: int) -> dict:
+    writer.write(NAMES[place], {"value": value})
+    return {}

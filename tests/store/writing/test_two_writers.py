@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import UsageError
 from dpcli.runtime import whole_file as module
 from dpcli.runtime.whole_file import put_in_place, whole_file
 from dpcli.store.writing import atomic_file
@@ -109,3 +110,59 @@ def test_what_only_looks_like_the_rest_of_a_killed_run_stays(tmp_path, monkeypat
     with whole_file(tmp_path / "a.html") as part:
         part.write_text("whole")
     assert sorted(os.listdir(tmp_path)) == sorted([*names, "a.html"])
+
+
+def _write_folder(path, names):
+    with whole_file(path) as part:
+        part.mkdir()
+        for name in names:
+            (part / name).write_text(name)
+
+
+def test_a_folder_is_replaced_by_renaming_so_that_a_kill_leaves_none_half_removed(tmp_path, monkeypatch):
+    """Killed as the old folder is removed, the new one is whole under its name; the next run removes what is left of the old."""
+    _write_folder(tmp_path / "out", "abc")
+
+    def killed(path, **how):
+        assert sorted(os.listdir(tmp_path / "out")) == ["d", "e"]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module.shutil, "rmtree", killed)
+        _write_folder(tmp_path / "out", "de")
+    assert sorted(os.listdir(tmp_path / "out")) == ["d", "e"]
+    left = next(path for path in tmp_path.iterdir() if path.name != "out")
+    left.rename(tmp_path / ".out.999999999.old")
+    _write_folder(tmp_path / "out", "f")
+    assert os.listdir(tmp_path) == ["out"] and os.listdir(tmp_path / "out") == ["f"]
+
+
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path, monkeypatch):
+    _write_folder(tmp_path / "out", "abc")
+    rename = os.replace
+
+    def refusing(old, new):
+        if str(old).endswith(".part"):
+            raise PermissionError(1, "not permitted")
+        rename(old, new)
+
+    with monkeypatch.context() as patch, pytest.raises(PermissionError):
+        patch.setattr(module.os, "replace", refusing)
+        _write_folder(tmp_path / "out", "de")
+    assert os.listdir(tmp_path) == ["out"] and sorted(os.listdir(tmp_path / "out")) == ["a", "b", "c"]
+
+
+def test_a_link_to_a_folder_is_written_through(tmp_path):
+    (tmp_path / "far").mkdir()
+    _write_folder(tmp_path / "far" / "real", "abc")
+    (tmp_path / "out").symlink_to("far/real")
+    _write_folder(tmp_path / "out", "de")
+    assert (tmp_path / "out").is_symlink() and os.listdir(tmp_path / "far") == ["real"]
+    assert sorted(os.listdir(tmp_path / "out")) == ["d", "e"]
+
+
+def test_the_current_folder_is_not_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in (".", str(tmp_path), f"../{tmp_path.name}"):
+        with pytest.raises(UsageError, match="is the current folder, which can't be replaced; name a new one in it"):
+            module.check_replaced(Path(name), ("*.png",))
