@@ -18,7 +18,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, tables_inside
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
@@ -305,6 +305,11 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
     shapes = [
         f"{name or 'an array'} {'list' if isinstance(one, list) else tuple(one.shape)}" for name, one in arrays.items()
     ]
+    if tables := tables_inside(path):
+        raise DataError(
+            f"{path}: holds a table{f' ({first_names(tables, 5)})' if any(tables) else ''}, not an array of clouds; write it as .csv or"
+            " .parquet (pandas: DataFrame.to_csv), and give --frame-column, or --track columns where a row is a frame"
+        )
     flat = [one for one in arrays.values() if not isinstance(one, list) and one.ndim == 2]
     if flat and not axes:
         raise DataError(

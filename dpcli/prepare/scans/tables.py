@@ -12,6 +12,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
+from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
@@ -65,6 +66,11 @@ class TableSequences(OwnScans):
     @cached_property
     def _paths(self) -> dict[str, Path]:
         """Returns the tables by the names of their sequences."""
+        if self.raw.is_file() and self.raw.suffix.lower() in SUFFIXES:
+            raise DataError(
+                f"{self.raw}: a file of arrays; the options of tables (--frame-column and the like) need it as .csv or .parquet."
+                " Arrays of clouds are read without them"
+            )
         refuse_file(self.raw, ())
         if self.raw.is_file():
             return {as_utf8(self.raw.stem): self.raw}
