@@ -291,6 +291,7 @@ class ArraySequences(OwnScans):
         told = [own[place] for own in shapes if (place := coordinates_axis(own)) is not None]
         columns = shape[axes.index("C")] if axes else max(told, default=3)
         said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
+        said += f"; {source.keys[0]} to {source.keys[-1]} taken as its frames" if len(source.keys) > 1 else ""
         said += f"; of each point the first 3 of {columns} numbers are read" if 3 < columns else ""
         return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
 
@@ -345,7 +346,8 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
     if axes:
         return list(_as_points(_cut(arrays[source.keys[0]], axes, source.place)))
     if len(source.keys) > 1:
-        return [_as_points(np.asarray(arrays[key][()])) for key in source.keys]
+        found = [np.asarray(arrays[key][()]) for key in source.keys]
+        return [_as_points(one) if one.size else np.zeros((0, 3), np.float32) for one in found]
     parts = arrays[source.keys[0]]
     if source.place is not None:
         own = axes_of(parts[source.place])
