@@ -34,7 +34,7 @@ from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
 from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
 from dpcli.runtime.clips.other_files import stand_in
 
-TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc", ".trc")
+TABLES = (".csv", ".tsv", ".parquet", ".feather", ".arrow", ".txt", ".xyz", ".asc", ".trc")
 MIXED = (
     "sequences whose frames mix the values of the column {0!r}; if it names the recordings, give --sequence-column {0}"
 )

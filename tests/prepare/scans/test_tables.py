@@ -298,6 +298,20 @@ def test_feather_is_read_as_pyarrow_wrote_it(tmp_path, packed, rows):
     assert "a.feather: not a readable Feather table" in item.problem
 
 
+def test_arrow_is_read_as_a_file_and_as_a_stream(tmp_path):
+    """Polars writes files under this name, Hugging Face's data sets streams; the first version of Feather is named."""
+    pyarrow = pytest.importorskip("pyarrow")
+    table = pyarrow.table({"frame": [0, 0, 1], "x": [1.0, 2.0, 3.0], "y": [0.0, 0.0, 1.0], "z": [1.0, 1.0, 1.0]})
+    for name, make in (("a", pyarrow.ipc.new_file), ("b", pyarrow.ipc.new_stream)):
+        with pyarrow.OSFile(str(tmp_path / f"{name}.arrow"), "wb") as file, make(file, table.schema) as writer:
+            writer.write_table(table, max_chunksize=2)
+        (sample,) = sequences(tmp_path / f"{name}.arrow")
+        assert sample.sequence.points[:, 0].tolist() == [1, 2, 3]
+    (tmp_path / "c.feather").write_bytes(b"FEA1" + bytes(60))
+    (item,) = TableSequences(tmp_path / "c.feather").items()
+    assert "c.feather: Feather of version 1; write it again" in item.problem
+
+
 def test_a_truncated_parquet_is_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and then nothing")
     pytest.importorskip("pyarrow")
