@@ -8,6 +8,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.array_files.containers import open_arrays
+from dpcli.prepare.array_files.depth_arrays import archived_depth
 from dpcli.prepare.scans.array_sequences import ArraySequences
 from tests.support.commands import told
 
@@ -35,6 +36,11 @@ def test_data_sets_that_were_never_written_refuse_no_others(tmp_path):
         )
         file.create_dataset("index/indicesLR", (131072,), "i4", chunks=(1024,), compression="gzip")
     assert np.array_equal(frames_of(tmp_path / "a.h5"), clouds())
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["depth"] = np.full((5, 40, 50), 900, np.uint16)
+        file.create_dataset("labels", (5,), "i4")
+    depth, beside = archived_depth(tmp_path / "c.h5")
+    assert depth.shape == (5, 40, 50) and not beside
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file.create_dataset("points", (6, 40, 3), "f4")
     run = told("prepare", "clouds", tmp_path / "b.h5", "-o", tmp_path / "b.out.h5", "--jobs", 1, "--item-seconds", 0)
