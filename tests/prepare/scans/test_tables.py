@@ -330,3 +330,25 @@ def test_numbers_of_frames_without_rows_are_told(tmp_path, places, step, first):
     assert sample.notes.get(SILENT, 0) == (missing if steady else 0)
     (timed,) = sequences(tmp_path / "log.csv", fps=10)  # whose times hold the gaps
     assert timed.notes == {}
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (("part-0", "part-1"), True),
+        (("rec/part-00000-8f3a.c000", "rec/part-00001-8f3a.c000"), True),
+        (("part.0", "part.1"), True),
+        (("train-00000-of-00002", "train-00001-of-00002"), True),
+        (("part-0", "walk"), False),
+        (("party-1", "party-2"), False),
+        (("1", "2"), False),
+    ],
+)
+def test_pieces_of_one_table_are_told(tmp_path, names, told):
+    """As programs write that divide a table among files: each file is a sequence, and a frame may be in two."""
+    for name in names:
+        path = tmp_path / f"{name}.csv"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
+    reader = TableSequences(tmp_path)
+    assert any("pieces of one table" in line for line in reader.summary(reader.items())) == told
