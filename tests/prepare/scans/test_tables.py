@@ -352,3 +352,12 @@ def test_pieces_of_one_table_are_told(tmp_path, names, told):
         path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
     reader = TableSequences(tmp_path)
     assert any("pieces of one table" in line for line in reader.summary(reader.items())) == told
+
+
+@pytest.mark.parametrize("option", ["frame_column", "sequence_column"])
+def test_columns_that_folders_of_a_divided_table_name(tmp_path, option):
+    path = tmp_path / "take=a" / "0.csv"
+    path.parent.mkdir()
+    path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
+    (item,) = TableSequences(tmp_path, **{option: "take"}).items()
+    assert "no such column" in item.problem and "Its folder take=a tells it: join the pieces" in item.problem
