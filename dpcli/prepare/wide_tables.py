@@ -27,7 +27,7 @@ _NO_PLACES = frozenset(  # words of columns in threes that are no place of a poi
     "velocity velocities vel speed acceleration accelerations acc accel gyro gyroscope gyr magnetometer mag imu jerk"
     " rotation rotations rot quaternion quaternions quat orientation orientations euler angle angles angular linear"
     " force forces moment moments torque torques power normal normals direction dir gaze scale size dimensions std"
-    " sigma cov error residual".split()
+    " stdev sigma var variance cov err error rms rmse uncertainty confidence residual".split()
 )
 
 
@@ -125,10 +125,12 @@ def _trios(told: list[list[str]]) -> list[tuple[int, int, int]]:
     """Returns the places of x, y and z of every point. told: the names of each column, the lowest last.
 
     Of columns called alike the first x goes with the first y and z. Columns of velocities, angles and the like are no points,
-    nor are three beside a w: a quaternion.
+    nor are three beside a w below the same names: a quaternion.
 
     >>> _trios([["frame"], ["a_x"], ["a_y"], ["a_z"], ["rot", "x"], ["", "y"], ["", "z"]])
     [(1, 2, 3)]
+    >>> _trios([*([name, axis] for name, axes in (("Rotation", "XYZW"), ("Position", "XYZ")) for axis in axes)])  # Motive's
+    [(4, 5, 6)]
     """
     places: dict[tuple[str, ...], dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
     for place, names in enumerate(told):
@@ -138,7 +140,8 @@ def _trios(told: list[list[str]]) -> list[tuple[int, int, int]]:
             places[tuple(word for word in words if word != axes[0])][axes[0]].append(place)
     found = []
     for axes in places.values():
-        turns = {place - 1 for place in axes.get("w", [])} | {place + 3 for place in axes.get("w", [])}
+        beside = [(last, place) for place in axes.get("w", []) for last in (place - 1, place + 3) if last < len(told)]
+        turns = {last for last, place in beside if told[last][:-1] == told[place][:-1]}
         if len({len(axes.get(axis, [])) for axis in "xyz"}) == 1:
             found += [trio for trio in zip(axes["x"], axes["y"], axes["z"]) if trio[2] not in turns]
     words = [{word for place in trio for name in told[place] for word in words_of(name)} for trio in found]

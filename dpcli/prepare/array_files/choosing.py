@@ -43,6 +43,9 @@ _COUNTS = re.compile(
 )
 _LABELS = re.compile(r"labels?|y|class(es)?|targets?|actions?|gestures?", re.IGNORECASE)
 
+_LOOKED_AT, _TELLING = 512, 8  # rows of an array that are looked at, and that are enough to tell what they hold
+_OF_LENGTH_ONE = 1e-3  # how far lengths of rounded directions are from 1
+
 
 @dataclass(frozen=True)
 class Source:
@@ -98,29 +101,52 @@ def _is_frame_or_video(parts: list[np.ndarray]) -> bool:
 def _sequences(array: Any, axes: str) -> int | None:
     """Returns how many sequences an array holds, None where it holds one."""
     if isinstance(array, list):
-        return None if all(one.ndim == 2 for one in array) else len(array)
+        return None if all(one.ndim == 2 for one in array if one.size) else len(array)
     if axes:
         return array.shape[axes.index("B")] if "B" in axes else None
     return array.shape[0] if array.ndim == 4 else None
 
 
 def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
-    """Returns the sequences of arrays (N,3 or more) whose names a number counts, one for each group of them."""
+    """Returns the sequences of arrays (N,3 or more) whose names a number counts, one for each group of them.
+
+    Those that begin with places and go on with whole numbers or directions are the points, colors, normals and triangles of one
+    cloud (``numpy.savez(file, points, colors)``, XDMF's ``data0`` and ``data1``).
+    """
     groups: dict[str, list[str]] = {}
     for name, one in arrays.items():
-        if not isinstance(one, list) and one.ndim == 2 and one.dtype.kind in "uif" and 3 <= one.shape[1] <= 10:
-            groups.setdefault(name.rpartition("/")[0], []).append(name)
+        if not isinstance(one, list) and one.ndim in (1, 2) and one.dtype.kind in "uif":
+            if 0 in one.shape or one.ndim == 2 and 3 <= one.shape[1] <= 10:
+                groups.setdefault(name.rpartition("/")[0], []).append(name)
     found = []
     for group, names in groups.items():
         last = [name.rpartition("/")[2] + "." for name in names]  # no suffix: a point may stand in a number
-        parsed = parse_names(last)
-        if len(names) > 1 and len({one.shape for one in parsed}) == 1 and len(NumberColumns(parsed).varying()) == 1:
-            columns = NumberColumns(parsed)
-            ordered = sorted(zip(parsed, names), key=lambda pair: columns.key(pair[0]))
-            found.append(Source(tuple(name for _, name in ordered), group))
+        named = list(zip(parse_names(last), names))
+        shapes = {own.shape for own, name in named if 0 not in arrays[name].shape}
+        named = [(own, name) for own, name in named if own.shape in shapes]  # nothing was seen in those without points
+        if (
+            len(named) < 2
+            or len(shapes) != 1
+            or len((columns := NumberColumns([own for own, _ in named])).varying()) != 1
+        ):
+            continue
+        ordered = [name for _, name in sorted(named, key=lambda pair: columns.key(pair[0]))]
+        filled = [arrays[name] for name in ordered if 0 not in arrays[name].shape]
+        if len({one.dtype.kind == "f" for one in filled}) == 1 and not _has_normals(filled):
+            found.append(Source(tuple(ordered), group))
     if len(found) == 1:
         return [Source(found[0].keys)]
     return sorted(found, key=lambda one: natural_key(one.name))
+
+
+def _has_normals(parts: list[Any]) -> bool:
+    """Returns whether some of several arrays (N,3 or more), but not the first, hold nothing but directions of length 1."""
+
+    def are_directions(array: Any) -> bool:
+        lengths = np.linalg.norm(np.asarray(array[:_LOOKED_AT, :3], np.float64), axis=1)
+        return array.shape[1] == 3 and len(lengths) >= _TELLING and bool((np.abs(lengths - 1) < _OF_LENGTH_ONE).all())
+
+    return not are_directions(parts[0]) and any(map(are_directions, parts[1:]))
 
 
 def _plain(shape: tuple[int, ...]) -> tuple[int, ...]:

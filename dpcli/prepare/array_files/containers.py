@@ -24,6 +24,8 @@ SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
+_MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
+_BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
 class Reversed:
@@ -43,21 +45,35 @@ class Reversed:
 
 class Unpacked:
     """Shows a data set that netCDF packed (xarray, sensors of weather and satellites) as the numbers that its attributes say it
-    stands for, f64.
+    stands for, f64, or of its own type where nothing is scaled; NaN where they say that a value is missing.
     """
 
-    dtype = np.dtype(np.float64)
-
-    def __init__(self, dataset: Any) -> None:
+    def __init__(self, dataset: Any, scaled: bool) -> None:
         self._dataset, self.attrs = dataset, dataset.attrs
+        self.dtype = np.dtype(np.float64) if scaled else dataset.dtype
         self.shape: tuple[int, ...] = dataset.shape
         self.ndim = len(self.shape)
 
     def __getitem__(self, key: Any) -> np.ndarray:
         stored = np.asarray(self._dataset[key], np.float64)
-        missing = np.isin(stored, [_attribute(self, name, np.nan) for name in ("_FillValue", "missing_value")])
+        missing = np.isin(stored, [_attribute(self, name, np.nan) for name in _MISSING])
         values = stored * _attribute(self, "scale_factor", 1) + _attribute(self, "add_offset", 0)
-        return np.where(missing, np.nan, values)
+        return np.where(missing, np.nan, values).astype(self.dtype)
+
+
+class Unreadable:
+    """Shows a data set that can't be read, so that an error says why only where somebody asks for its numbers: a file may hold
+    others that nobody needs, such as the indices of PyTables, most of which were never written.
+    """
+
+    def __init__(self, dataset: Any, error: DataError) -> None:
+        self.attrs, self._error = dataset.attrs, error
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype: np.dtype = dataset.dtype
+        self.ndim = len(self.shape)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        raise self._error
 
 
 def _attribute(dataset: Any, name: str, default: float) -> float:
@@ -66,7 +82,7 @@ def _attribute(dataset: Any, name: str, default: float) -> float:
     return float(told[0]) if told.dtype.kind in "uif" and told.size == 1 else default
 
 
-Array = Any  # np.ndarray, h5py.Dataset, Reversed or Unpacked: shape, dtype, ndim, and slices of it by []
+Array = Any  # np.ndarray, h5py.Dataset, Reversed, Unpacked or Unreadable: shape, dtype, ndim, and slices of it by []
 
 
 @contextmanager
@@ -106,6 +122,27 @@ def made_by_dpc(path: Path) -> bool:
         return False
 
 
+def tables_inside(path: Path) -> list[str]:
+    """Returns the names of the tables in a file, whose columns are called by name, "" of a file's only array: PyTables and
+    pandas keep them so in HDF5, NumPy as structured arrays.
+    """
+    import h5py
+
+    if not is_hdf5(path):
+        facts = path.stat()
+        arrays = {} if path.suffix.lower() == ".mat" else _read_all(path, facts.st_size, facts.st_mtime_ns)
+        return [name for name, one in arrays.items() if not isinstance(one, list) and one.dtype.names]
+    found: list[str] = []
+
+    def note(name: str, item: Any) -> None:
+        if "pandas_type" in item.attrs if isinstance(item, h5py.Group) else item.dtype.names:
+            found.append(name)
+
+    with reading(path), h5py.File(path, "r") as file:
+        file.visititems(note)
+    return [name for name in found if not any(name.startswith(f"{other}/") for other in found)]
+
+
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
     import h5py
@@ -122,13 +159,39 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
         matlab = path.suffix.lower() == ".mat"
         found: dict[str, Array | list[np.ndarray]] = {}
         for name, item in _datasets(file, path):
-            refuse_claim(item, path)
             if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
+                refuse_claim(item, path)
                 found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uif" and item.ndim:
-                packed = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
-                found[name] = Reversed(item) if matlab else Unpacked(item) if packed else item
+            elif item.dtype.kind in "uif" and item.ndim and not _is_bare_dimension(item):
+                try:
+                    refuse_claim(item, path)
+                    _refuse_filters(item, path)
+                except DataError as error:
+                    found[name] = Unreadable(item, error)
+                    continue
+                scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
+                marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
+                found[name] = Reversed(item) if matlab else Unpacked(item, scaled) if scaled or marked else item
         yield found
+
+
+def _is_bare_dimension(item: h5py.Dataset) -> bool:
+    """Returns whether a data set is only the name and length of a dimension of netCDF, without values."""
+    return _BARE_DIMENSION in str(item.attrs.get("NAME", ""))
+
+
+def _refuse_filters(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError for a data set that was packed by a filter that the HDF5 library here lacks, such as Blosc."""
+    import h5py
+
+    plist = item.id.get_create_plist()
+    for place in range(plist.get_nfilters()):
+        code, _, _, name = plist.get_filter(place)
+        if not h5py.h5z.filter_avail(code):
+            raise DataError(
+                f"{path}: {item.name} was packed by {name.decode('latin-1') or 'a filter'} (HDF5 filter {code}), which is missing"
+                " here; write it again with gzip, or unpacked"
+            )
 
 
 def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.array_files.containers import open_arrays
+from dpcli.prepare.array_files.containers import Unreadable, open_arrays
 
 # names that say depth, and not a picture of it or what lies beside it
 DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
@@ -74,7 +74,8 @@ def archived_depth(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         others = {name: one for name, one in arrays.items() if name != chosen}
         depth = np.asarray(arrays[chosen][()])
         depth = _of_matlab(path, depth) if path.suffix.lower() == ".mat" else depth
-        return depth, {name: np.asarray(one[()]) for name, one in others.items() if np.prod(one.shape) <= _SMALL}
+        small = {name: one for name, one in others.items() if np.prod(one.shape) <= _SMALL}
+        return depth, {name: np.asarray(one[()]) for name, one in small.items() if not isinstance(one, Unreadable)}
 
 
 def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""MATLAB files of version 5, arrays of numbers and cells of them, by the published layout (MathWorks, MAT-File Format).
+"""MATLAB files of version 5, arrays of numbers, cells of them and structs of both, by the published layout (MathWorks, MAT-File Format).
 
 Every length is checked against the bytes that are there: compiled readers end the process at some damaged files.
 """
@@ -20,7 +20,7 @@ _HEADER = 128
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # as stored
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}  # as meant
 _MATRIX, _COMPRESSED = 14, 15
-_CELL = 1  # of the classes
+_CELL, _STRUCT = 1, 2  # of the classes
 _COMPLEX = 8  # flag
 _BEGIN = 4096  # bytes of a compressed array in which its name and shape are
 _MOST = 1 << 31  # bytes of one array
@@ -98,7 +98,9 @@ def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) ->
 
 def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
     """Returns all variables that are arrays of real numbers, or cells of such arrays (as lists, column after column), by
-    name; others are passed over. Raises DataError as `read_mat5`, and where a file unpacks to far more than it has.
+    name, and such fields of structs as ``struct/field``, as MATLAB 7.3 has them; others are passed over.
+
+    Raises DataError as `read_mat5`, and where a file unpacks to far more than it has.
     """
     found: dict[str, np.ndarray | list[np.ndarray]] = {}
     data, order = _opened(path)
@@ -113,7 +115,7 @@ def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
                 kind, content = next(_elements(content, order), (0, b""))
             if kind == _MATRIX:
                 name, values = _matrix(content, order)
-                found |= {name: values} if values is not None else {}
+                found |= {name: values} if values is not None else _fields(content, order)
     except (_Damaged, zlib.error) as error:
         raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
     return found
@@ -130,6 +132,29 @@ def _matrix(content: bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarr
         return name, plain if plain and len(plain) == len(inside) else None
     dtype = _type_of(flags, order)
     return name, None if dtype is None else _numbers(rest, dtype, shape, name, order)
+
+
+def _fields(content: bytes, order: str) -> dict[str, np.ndarray | list[np.ndarray]]:
+    """Returns what `_matrix` does of each field of a struct, by ``struct/field``, a list of an array of several structs; {} of
+    anything else. Structs in structs are passed over.
+    """
+    flags, _, name, used = _head(content, order)
+    if flags & 0xFF != _STRUCT:
+        return {}
+    parts = [part for _, part in _elements(memoryview(content)[used:], order)]
+    size = int(np.frombuffer(parts[0], order + "i4", 1)[0]) if len(parts) > 1 and len(parts[0]) >= 4 else 0
+    if size < 1 or len(parts[1]) % size or (len(parts) - 2) % max(1, len(parts[1]) // size):
+        raise _Damaged(f"{name!r}, a struct that lacks names of fields, or some fields")
+    names, values = parts[1], parts[2:]
+    words = [bytes(names[at : at + size]).split(b"\0")[0].decode("latin1") for at in range(0, len(names), size)]
+    found: dict[str, np.ndarray | list[np.ndarray]] = {}
+    for place, word in enumerate(words):
+        own = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in values[place :: len(words)]]
+        if len(own) == 1 and own[0] is not None:
+            found[f"{name}/{word}"] = own[0]
+        elif len(own) > 1 and all(isinstance(one, np.ndarray) for one in own):
+            found[f"{name}/{word}"] = own
+    return found
 
 
 def _type_of(flags: int, order: str) -> np.dtype | None:

@@ -60,13 +60,14 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
     if key is None:
         raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
-    color_key = next((k for k in _COLOR_KEYS if k in arrays), "")
+    color_key, rows = next((k for k in _COLOR_KEYS if k in arrays), ""), len(cloud.points)
     if color_key:
-        color, rows = arrays[color_key], len(cloud.points)
+        color = arrays[color_key]
         if color.dtype.kind not in "uif" or color.ndim != 2 or color.shape[0] != rows or color.shape[1] not in (3, 4):
             raise DataError(f"{path}: colors {color.dtype} {color.shape}; expected numbers {(rows, 3)}")
         cloud.color = color[:, :3]
-    columns = {name: values for name, values in arrays.items() if values.shape == (len(cloud.points),)}
+    shapes = ((rows,), (rows, 1))  # the second as Open3D writes attributes
+    columns = {name: one.reshape(-1) for name, one in arrays.items() if one.shape in shapes}
     missing = [name for name in keep if name not in columns]
     if missing:
         raise DataError(f"{path}: column {missing[0]}: no such array of one number a point")

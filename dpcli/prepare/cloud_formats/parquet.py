@@ -12,7 +12,7 @@ from dpcli.errors import DataError, DpcError
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
 
-COLUMNAR = (".parquet", ".feather")
+COLUMNAR = (".parquet", ".feather", ".arrow")
 _CELL = 8  # bytes of a number
 
 
@@ -28,7 +28,7 @@ class ParquetTable:
             raise DpcError('Parquet and Feather need pyarrow: pip install "dpc-toolkit[parquet]"') from None
         self.path = path
         try:
-            if path.suffix.lower() == ".feather":
+            if path.suffix.lower() != ".parquet":
                 self._table: Any = _read_feather(path)
             else:
                 about = parquet.read_metadata(path)
@@ -98,13 +98,19 @@ def _read_feather(path: Path) -> Any:
     """Returns the table of a Feather file (Arrow's), batch after batch, so that one that claims too much ends early."""
     import pyarrow
 
-    with pyarrow.memory_map(str(path)) as file, pyarrow.ipc.open_file(file) as reader:
-        batches, taken = [], 0
-        for place in range(reader.num_record_batches):
-            batches.append(reader.get_batch(place))
-            taken += batches[-1].nbytes
-            require_room(path, taken)
-        return pyarrow.Table.from_batches(batches, reader.schema)
+    with pyarrow.memory_map(str(path)) as file:
+        begin = file.read(4)
+        streamed = begin == b"\xff\xff\xff\xff"
+        if begin == b"FEA1":
+            raise DataError(f"{path}: Feather of version 1; write it again, as version 2")
+        file.seek(0)
+        with (pyarrow.ipc.open_stream if streamed else pyarrow.ipc.open_file)(file) as reader:
+            batches, taken = [], 0
+            for batch in reader if streamed else map(reader.get_batch, range(reader.num_record_batches)):
+                batches.append(batch)
+                taken += batch.nbytes
+                require_room(path, taken)
+            return pyarrow.Table.from_batches(batches, reader.schema)
 
 
 def read_parquet(path: Path, keep: Sequence[str] = ()) -> Cloud:

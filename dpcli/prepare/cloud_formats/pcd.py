@@ -18,6 +18,7 @@ _DATA = ("ascii", "binary", "binary_compressed")
 _TYPES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _MOST_BYTES = 1 << 32  # of a compressed cloud, unpacked
 POSED = "frames with a sensor pose (VIEWPOINT of PCD), which is not applied: points stay in the axes they are stored in"
+BLACK = "texts (PCD) whose colors are all 0, as some writers round them; save them as binary"
 
 
 @dataclass(frozen=True)
@@ -130,15 +131,16 @@ def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.nd
     table = TextTable(path, tuple(names), _lines(body), header.lines + 1, limit=header.points)
     values = table.columns(range(len(names)))
     beyond = require_points(path, header.points, table.rows if len(values) == header.points else len(values))
-    columns = {}
+    columns, black = {}, {}
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
         whole = kind.kind == "f" or (np.isfinite(column).all() and (column == np.floor(column)).all())
         # whole numbers, as some write them, or a color whose bytes are no number, which a text can't hold
         odd = (column >= 1) | (np.isnan(column) & np.isfinite(values).any(1))
         packed = name in ("rgb", "rgba") and kind.kind == "f" and odd.any()
+        black = {BLACK: 1} if name == "rgb" and kind.kind == "f" and len(column) and not column.any() else black
         columns[name] = column if packed or not whole else column.astype(kind)
-    return columns, beyond | table.cut
+    return columns, beyond | table.cut | black
 
 
 def _lines(body: bytes) -> str:

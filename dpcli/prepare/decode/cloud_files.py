@@ -27,6 +27,7 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".npz": read_npz,
     ".parquet": read_parquet,
     ".feather": read_parquet,
+    ".arrow": read_parquet,
     ".ptx": read_ptx,
     ".csv": read_text,
     ".tsv": read_text,

@@ -13,6 +13,8 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, without
 
 JOINED = "E57 files of several scans, which are joined as their poses say"
 PLAIN = "E57 files in which some scans have colors and some have none; colors are not read"
+INVALID = "points that their file marks as invalid dropped"
+_COUNT = re.compile(r"<points\b[^>]*\brecordCount=[\"'](\d+)[\"']")  # of a scan's points, valid or not
 _PROTOTYPE = re.compile(r"<prototype\b.*?</prototype>", re.DOTALL)  # what each record of a scan holds
 _FIELD = re.compile(r"<(\w+)\s+type=\"(?:Float|ScaledInteger|Integer)\"")
 _AXES = (
@@ -39,6 +41,8 @@ def read_e57(path: Path, keep: Sequence[str] = ()) -> Cloud:
     colors = found.color if all(colored) and len(found.color) == len(found.points) else None
     told = {JOINED: 1} if len(scans) > 1 else {}
     told |= {PLAIN: 1} if any(colored) and colors is None else {}
+    left = sum(map(int, _COUNT.findall(text))) - len(found.points)
+    told |= {INVALID: left} if left > 0 else {}
     unread = without(list(dict.fromkeys(name for fields in scans for name in fields)), _AXES, _COLORS)
     return Cloud(found.points, colors, "m", unread=unread, dropped=told)
 

@@ -18,7 +18,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, tables_inside
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
@@ -291,6 +291,7 @@ class ArraySequences(OwnScans):
         told = [own[place] for own in shapes if (place := coordinates_axis(own)) is not None]
         columns = shape[axes.index("C")] if axes else max(told, default=3)
         said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
+        said += f"; {source.keys[0]} to {source.keys[-1]} taken as its frames" if len(source.keys) > 1 else ""
         said += f"; of each point the first 3 of {columns} numbers are read" if 3 < columns else ""
         return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
 
@@ -305,6 +306,11 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
     shapes = [
         f"{name or 'an array'} {'list' if isinstance(one, list) else tuple(one.shape)}" for name, one in arrays.items()
     ]
+    if tables := tables_inside(path):
+        raise DataError(
+            f"{path}: holds a table{f' ({first_names(tables, 5)})' if any(tables) else ''}, not an array of clouds; write it as .csv or"
+            " .parquet (pandas: DataFrame.to_csv), and give --frame-column, or --track columns where a row is a frame"
+        )
     flat = [one for one in arrays.values() if not isinstance(one, list) and one.ndim == 2]
     if flat and not axes:
         raise DataError(
@@ -340,7 +346,8 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
     if axes:
         return list(_as_points(_cut(arrays[source.keys[0]], axes, source.place)))
     if len(source.keys) > 1:
-        return [_as_points(np.asarray(arrays[key][()])) for key in source.keys]
+        found = [np.asarray(arrays[key][()]) for key in source.keys]
+        return [_as_points(one) if one.size else np.zeros((0, 3), np.float32) for one in found]
     parts = arrays[source.keys[0]]
     if source.place is not None:
         own = axes_of(parts[source.place])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,6 +20,7 @@ _STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -327
 # on all three axes
 _ROUNDED = 1e-8  # what remains of 0 where points were turned, or the smallest number of a type
 _SAMPLED, _SEVERAL = 2048, 8
+_JUMP, _OF_SIZE = 5, 0.25  # times the longest other step of any point; share of the widest frame
 _FARTHEST = 1e10  # no map has such coordinates, in any unit
 
 
@@ -27,7 +29,8 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
 
     One point at the origin in a frame may be a corner of a modeled shape and stays, unless some frame has more, as two points
     of one measurement are never at the same place, or has nothing else while others have several points: radars log a row of
-    zeros for a frame in which they saw nothing. Other lone points with equal coordinates, such as -1, are counted only.
+    zeros for a frame in which they saw nothing; or unless a point with an identity jumps there, as markers that nobody sees
+    do in tables. Other lone points with equal coordinates, such as -1, are counted only.
     """
     found: Counter[str] = Counter()
     origins = []
@@ -43,7 +46,8 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
     alone = several and any(own.all() for own in origins if len(own))
     if several:
         found |= _lone(clouds)
-    if alone or any(np.count_nonzero(own) > 1 for own in origins) or _far_from_origin(clouds, origins):
+    doubled = any(np.count_nonzero(own) > 1 for own in origins)
+    if alone or doubled or _far_from_origin(clouds, origins) or _jumps_to_origin(clouds, origins):
         found[AT_ORIGIN] = sum(_drop(cloud, own) for cloud, own in zip(clouds, origins))
     return {what: count for what, count in found.items() if count}
 
@@ -102,3 +106,19 @@ def _far_from_origin(clouds: Sequence[Cloud], origins: Sequence[np.ndarray]) -> 
         if own.any() and not own.all() and np.abs(cloud.points[~own]).max(1).min() > 1e4:
             return True
     return False
+
+
+def _jumps_to_origin(clouds: Sequence[Cloud], origins: Sequence[np.ndarray]) -> bool:
+    """Returns whether some point that is followed is at the origin in one frame and far away in the next, or the other way
+    round, far more than any point moves else.
+    """
+    if not any(own.any() for own in origins) or any(cloud.track is None for cloud in clouds):
+        return False
+    away, most = 0.0, 0.0
+    for (first, at_first), (second, at_second) in pairwise(zip(clouds, origins)):
+        _, ours, theirs = np.intersect1d(first.track, second.track, return_indices=True)
+        steps = np.linalg.norm(first.points[ours].astype(np.float64) - second.points[theirs], axis=1)
+        left = at_first[ours] != at_second[theirs]
+        away, most = max(away, steps[left].max(initial=0)), max(most, steps[~left].max(initial=0))
+    size = max(float(np.ptp(ends_of(cloud.points[~own]), axis=0).max()) for cloud, own in zip(clouds, origins))
+    return away > max(_JUMP * most, _OF_SIZE * size)

@@ -90,7 +90,9 @@ def frame_column(table: Table, wanted: str) -> str:
     """Returns the name of the column of frames: the one ``wanted``, or the one whose name says it. Raises DataError."""
     known = ", ".join(table.names)[:200] or "none: it has no header"
     if wanted and wanted not in table.names:
-        raise DataError(f"{table.path}: --frame-column {wanted}: no such column; found {known}")
+        raise DataError(
+            f"{table.path}: --frame-column {wanted}: no such column; found {known}{_in_folders(table, wanted)}"
+        )
     found = wanted or find_frame_column(table.names)
     if not found:
         raise DataError(
@@ -182,12 +184,21 @@ def _exact(words: list[str], values: np.ndarray) -> np.ndarray:
         return values
 
 
+def _in_folders(table: Table, column: str) -> str:
+    """Returns what to do where the folders of a divided table name the values of a column, as in ``frame=3/part-0.parquet``."""
+    told = next((part for part in table.path.parts if part.startswith(f"{column}=")), "")
+    joined = "pandas.read_parquet(FOLDER).to_parquet(FILE)"
+    return f". Its folder {told} tells it: join the pieces into one table, such as by {joined}" if told else ""
+
+
 def _groups(table: Table, column: str, count: int) -> list[tuple[str, np.ndarray]]:
     if not column:
         return [("", np.arange(count))]
     if column not in table.names:
         known = ", ".join(table.names)[:200]
-        raise DataError(f"{table.path}: --sequence-column {column}: no such column; found {known}")
+        raise DataError(
+            f"{table.path}: --sequence-column {column}: no such column; found {known}{_in_folders(table, column)}"
+        )
     words = np.array(table.words(table.names.index(column)))
     order = dict.fromkeys(words.tolist())
     if "" in order:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -11,7 +12,8 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import as_utf8
+from dpcli.path_names import as_utf8, first_names
+from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
@@ -33,11 +35,16 @@ from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
 from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
 from dpcli.runtime.clips.other_files import stand_in
 
-TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc", ".trc")
+TABLES = (".csv", ".tsv", ".parquet", ".feather", ".arrow", ".txt", ".xyz", ".asc", ".trc")
 MIXED = (
     "sequences whose frames mix the values of the column {0!r}; if it names the recordings, give --sequence-column {0}"
 )
 WIDE = "sequences of which one point of a row was read, {}; others were not, such as {}; " + ROWS_ARE_FRAMES
+_PIECE = re.compile(r"(.*/)?(part[-.]\d+([-.].*)?|.*-\d{5}-of-\d{5})")  # as Spark, pyarrow, Dask and others name them
+PIECES = (
+    "{0} are called like pieces of one table; each is read as sequences of its own. If they are pieces, join them, such as by"
+    " pandas.read_parquet(FOLDER).to_parquet(FILE)"
+)
 _FEW = 5  # frames of one point that may be true
 
 
@@ -65,6 +72,11 @@ class TableSequences(OwnScans):
     @cached_property
     def _paths(self) -> dict[str, Path]:
         """Returns the tables by the names of their sequences."""
+        if self.raw.is_file() and self.raw.suffix.lower() in SUFFIXES:
+            raise DataError(
+                f"{self.raw}: a file of arrays; the options of tables (--frame-column and the like) need it as .csv or .parquet."
+                " Arrays of clouds are read without them"
+            )
         refuse_file(self.raw, ())
         if self.raw.is_file():
             return {as_utf8(self.raw.stem): self.raw}
@@ -177,6 +189,8 @@ class TableSequences(OwnScans):
                 lines[0] += f", times by column {' and '.join(map(repr, clock))}"
             lines[0] += f"; not read: {unused}" if unused else ""
             lines[0] += " (--keep-fields)" if unused and self.track != COLUMNS else ""
+        pieces = [name for name in self._paths if _PIECE.fullmatch(name)]
+        lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
         return lines + (self._table.unnamed(items) if self._table else [])
 
 

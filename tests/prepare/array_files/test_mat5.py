@@ -13,7 +13,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from dpcli.errors import DataError
-from dpcli.prepare.array_files.mat5 import read_mat5
+from dpcli.prepare.array_files.mat5 import read_mat5, read_variables
 from tests.support.prepare_helpers import dpc, write_msr
 
 RNG = np.random.default_rng(0)
@@ -29,6 +29,48 @@ def test_arrays_are_read_as_scipy_reads_them(tmp_path, kind, compressed):
         savemat(tmp_path / "a.mat", others, do_compression=compressed)
         found, known = read_mat5(tmp_path / "a.mat", "depth"), loadmat(tmp_path / "a.mat")["depth"]
         assert found.dtype == known.dtype and found.shape == known.shape and np.array_equal(found, known)
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_fields_of_structs_are_read_as_matlab_7_3_has_them(tmp_path, compressed):
+    """A struct, an array of structs whose fields become lists, and what is passed over: texts, structs in structs."""
+    frames = [RNG.normal(size=(count, 3)) for count in (4, 9, 1)]
+    structs = np.array(
+        [(frame, t / 10, "x") for t, frame in enumerate(frames)], [(n, object) for n in ("xyz", "t", "who")]
+    )
+    cell = np.empty(3, object)
+    cell[:] = frames
+    one = {
+        "points": RNG.normal(size=(2, 5, 3)),
+        "name": "walk",
+        "deep": {"a": 1.0},
+        "cell": cell,
+        "a_rather_long_name": 7,
+    }
+    savemat(tmp_path / "a.mat", {"one": one, "many": structs, "none": {}, "plain": [1, 2]}, do_compression=compressed)
+    found = read_variables(tmp_path / "a.mat")
+    assert set(found) == {"one/points", "one/cell", "one/a_rather_long_name", "many/xyz", "many/t", "plain"}
+    assert np.array_equal(found["one/points"], one["points"]) and found["one/a_rather_long_name"] == 7
+    assert all(
+        np.array_equal(a, b) for name in ("one/cell", "many/xyz") for a, b in zip(found[name], frames, strict=True)
+    )
+    assert np.allclose(np.ravel(found["many/t"]), [0, 0.1, 0.2])
+
+
+def test_damaged_structs_end_with_a_sentence(tmp_path):
+    points = np.arange(30.0).reshape(2, 5, 3)
+    savemat(tmp_path / "a.mat", {"one": {"points": points, "t": [0.1, 0.2]}})
+    whole, read = (tmp_path / "a.mat").read_bytes(), 0
+    for _ in range(3000):
+        data = bytearray(whole)
+        for at in RNG.integers(128, len(data), RNG.integers(1, 4)):
+            data[at] = RNG.integers(256)
+        (tmp_path / "a.mat").write_bytes(data[: RNG.integers(130, 2 * len(data))])
+        try:
+            read += "one/points" in read_variables(tmp_path / "a.mat")
+        except DataError:
+            pass
+    assert 100 < read < 3000
 
 
 def test_big_endian_and_numbers_stored_in_fewer_bytes(tmp_path):

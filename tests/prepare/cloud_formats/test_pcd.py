@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.ops.open3d_import import load_open3d
-from dpcli.prepare.cloud_formats.pcd import POSED, read_pcd
+from dpcli.prepare.cloud_formats.pcd import BLACK, POSED, read_pcd
 
 quick = settings(
     max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -150,3 +150,16 @@ def test_a_sensor_pose_is_told_and_not_applied(tmp_path, viewpoint, posed):
     (tmp_path / "a.pcd").write_text(text)
     cloud = read_pcd(tmp_path / "a.pcd")
     assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.dropped == ({POSED: 1} if posed else {})
+
+
+@pytest.mark.parametrize("encoding", [pypcd4.Encoding.ASCII, pypcd4.Encoding.BINARY])
+def test_colors_that_a_text_rounds_to_nothing_are_told(tmp_path, encoding):
+    """As pypcd4 writes texts: the bytes of a color are a tiny float32, of which ten decimals are 0."""
+    colors = np.random.default_rng(5).integers(0, 256, (20, 3)).astype(np.uint8)
+    columns = [np.arange(20, dtype=np.float32)] * 3 + [pypcd4.PointCloud.encode_rgb(colors)]
+    pypcd4.PointCloud.from_xyzrgb_points(columns).save(tmp_path / "a.pcd", encoding)
+    cloud = read_pcd(tmp_path / "a.pcd")
+    if encoding == pypcd4.Encoding.ASCII:
+        assert not cloud.color.any() and cloud.dropped == {BLACK: 1}
+    else:
+        assert np.array_equal(cloud.color, colors) and not cloud.dropped

@@ -10,7 +10,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cloud_files import read_cloud
-from dpcli.prepare.decode.e57_files import JOINED, PLAIN
+from dpcli.prepare.decode.e57_files import INVALID, JOINED, PLAIN
 
 PAGE, HEAD = 1024, 48
 
@@ -120,7 +120,7 @@ def test_scans_are_joined_by_their_poses(tmp_path, seed):
     moved = second["points"][invalid == 0] @ about_z.T + (1, 2, 3)
     both = read_cloud(tmp_path / "b.e57")
     assert np.allclose(both.points, np.concatenate([first["points"], moved])) and both.color is None
-    assert both.dropped == {JOINED: 1, PLAIN: 1}
+    assert both.dropped == {JOINED: 1, PLAIN: 1, INVALID: int(invalid.sum())}
 
 
 def test_damage_is_told_by_the_checksums(tmp_path):

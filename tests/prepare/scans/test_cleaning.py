@@ -70,6 +70,25 @@ def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
     assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + 448_000]))]) == {AT_ORIGIN: 1}
 
 
+@pytest.mark.parametrize("jump", [True, False])
+def test_a_followed_point_that_jumps_to_the_origin_was_not_seen(jump):
+    """As the tables of motion capture have hidden markers; one that begins or rests there, or passes by, was seen."""
+    frames = [POINTS + 0.02 * t for t in range(6)]
+    if jump:
+        frames[2][3] = frames[4][7] = 0
+    else:
+        frames = [frame - POINTS[5] - 0.06 for frame in frames]  # the sixth point passes the origin in the fourth frame
+        frames = [np.concatenate([frame, [[0, 0, 0]]]) for frame in frames[:3]] + [np.float64(frames[3])]
+    clouds = [Cloud(frame.copy(), track=np.arange(len(frame))) for frame in frames]
+    assert clean(clouds) == ({AT_ORIGIN: 2} if jump else {})
+    lost = {2: [3], 4: [7]} if jump else {}
+    assert [c.track.tolist() for c in clouds] == [
+        np.delete(np.arange(len(frame)), lost.get(t, [])).tolist() for t, frame in enumerate(frames)
+    ]
+    clouds = [Cloud(frame.copy()) for frame in frames]  # without identities nothing tells
+    assert not clean(clouds)
+
+
 def test_frames_of_one_row_that_stands_for_nothing():
     nothing = np.zeros((1, 3))
     assert clean([Cloud(POINTS), Cloud(nothing), Cloud(nothing)]) == {AT_ORIGIN: 2}

@@ -298,6 +298,20 @@ def test_feather_is_read_as_pyarrow_wrote_it(tmp_path, packed, rows):
     assert "a.feather: not a readable Feather table" in item.problem
 
 
+def test_arrow_is_read_as_a_file_and_as_a_stream(tmp_path):
+    """Polars writes files under this name, Hugging Face's data sets streams; the first version of Feather is named."""
+    pyarrow = pytest.importorskip("pyarrow")
+    table = pyarrow.table({"frame": [0, 0, 1], "x": [1.0, 2.0, 3.0], "y": [0.0, 0.0, 1.0], "z": [1.0, 1.0, 1.0]})
+    for name, make in (("a", pyarrow.ipc.new_file), ("b", pyarrow.ipc.new_stream)):
+        with pyarrow.OSFile(str(tmp_path / f"{name}.arrow"), "wb") as file, make(file, table.schema) as writer:
+            writer.write_table(table, max_chunksize=2)
+        (sample,) = sequences(tmp_path / f"{name}.arrow")
+        assert sample.sequence.points[:, 0].tolist() == [1, 2, 3]
+    (tmp_path / "c.feather").write_bytes(b"FEA1" + bytes(60))
+    (item,) = TableSequences(tmp_path / "c.feather").items()
+    assert "c.feather: Feather of version 1; write it again" in item.problem
+
+
 def test_a_truncated_parquet_is_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and then nothing")
     pytest.importorskip("pyarrow")
@@ -316,3 +330,34 @@ def test_numbers_of_frames_without_rows_are_told(tmp_path, places, step, first):
     assert sample.notes.get(SILENT, 0) == (missing if steady else 0)
     (timed,) = sequences(tmp_path / "log.csv", fps=10)  # whose times hold the gaps
     assert timed.notes == {}
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (("part-0", "part-1"), True),
+        (("rec/part-00000-8f3a.c000", "rec/part-00001-8f3a.c000"), True),
+        (("part.0", "part.1"), True),
+        (("train-00000-of-00002", "train-00001-of-00002"), True),
+        (("part-0", "walk"), False),
+        (("party-1", "party-2"), False),
+        (("1", "2"), False),
+    ],
+)
+def test_pieces_of_one_table_are_told(tmp_path, names, told):
+    """As programs write that divide a table among files: each file is a sequence, and a frame may be in two."""
+    for name in names:
+        path = tmp_path / f"{name}.csv"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
+    reader = TableSequences(tmp_path)
+    assert any("pieces of one table" in line for line in reader.summary(reader.items())) == told
+
+
+@pytest.mark.parametrize("option", ["frame_column", "sequence_column"])
+def test_columns_that_folders_of_a_divided_table_name(tmp_path, option):
+    path = tmp_path / "take=a" / "0.csv"
+    path.parent.mkdir()
+    path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
+    (item,) = TableSequences(tmp_path, **{option: "take"}).items()
+    assert "no such column" in item.problem and "Its folder take=a tells it: join the pieces" in item.problem

@@ -170,3 +170,24 @@ def test_formats_of_motion_capture_are_told_what_to_do(tmp_path: Path) -> None:
         for raw in (folder, folder / name)[: 1 if name == "walk.trc" else 2]:
             said = told("prepare", "clouds", raw, "-o", tmp_path / "out.h5")
             assert said.returncode == 3 and advice in " ".join(said.stderr.split())
+
+
+def test_the_place_of_a_rigid_body_stands_behind_its_quaternion(tmp_path: Path) -> None:
+    """As Motive writes both; of columns of errors, too, none is a point."""
+    points = np.concatenate([_moving().mean(1, keepdims=True), _moving()[:, :2]], axis=1)
+    rows = [
+        ["", "", *["Rigid Body"] * 8, *["Marker"] * 6],
+        ["", "", *["Box"] * 8, *["A"] * 3, *["B"] * 3],
+        ["", "", *["Rotation"] * 4, *["Position"] * 3, "Mean Marker Error", *["Position"] * 6],
+        ["Frame", "Time (Seconds)", *"XYZW", *"XYZ", "", *"XYZ" * 2],
+    ]
+    numbers = [[t, t / 100, 0, 0, 0, 1, *own[0], 0.1, *own[1:].ravel()] for t, own in enumerate(points)]
+    (tmp_path / "take.csv").write_text("\n".join(",".join(map(str, row)) for row in [*rows, *numbers]) + "\n")
+    names = [f"{name}_{axis}{kind}" for name in "abc" for axis in "xyz" for kind in ("", "_err")]
+    table = np.repeat(points.reshape(len(points), -1), 2, axis=1)
+    table[:, 1::2] = 0.01
+    np.savetxt(tmp_path / "errors.csv", table, delimiter=",", header=",".join(names), comments="", fmt="%.9g")
+    for name in ("take.csv", "errors.csv"):
+        (item,) = (reader := TableSequences(tmp_path / name, track="columns")).items()
+        found = reader.read(item, np.random.default_rng(0)).sequence.points.reshape(points.shape)
+        np.testing.assert_allclose(found, points, atol=1e-5)

@@ -1,0 +1,99 @@
+"""HDF5 files as PyTables, pandas and netCDF write them, with bytes written here: what they hold beside plain arrays."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.prepare.array_files.containers import open_arrays
+from dpcli.prepare.array_files.depth_arrays import archived_depth
+from dpcli.prepare.scans.array_sequences import ArraySequences
+from tests.support.commands import told
+
+
+def clouds(frames: int = 6, points: int = 40) -> np.ndarray:
+    """Points that move a little, f32 (T,N,3)."""
+    rng = np.random.default_rng(1)
+    return np.float32(rng.normal(size=(points, 3)) + np.arange(frames)[:, None, None] * 0.02 + 3)
+
+
+def frames_of(path) -> list[np.ndarray]:
+    """The points of the frames of a file's only sequence."""
+    reader = ArraySequences(path)
+    (item,) = reader.items()
+    sample = reader.read(item, np.random.default_rng(0))
+    return np.split(sample.sequence.points, sample.sequence.frame_offsets[1:-1])
+
+
+def test_data_sets_that_were_never_written_refuse_no_others(tmp_path):
+    """Dimensions without values (netCDF), and the indices that pandas adds to its tables."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = clouds()
+        file.create_dataset("time", (6,), "f4").attrs["NAME"] = np.bytes_(
+            "This is a netCDF dimension but not a netCDF variable         6"
+        )
+        file.create_dataset("index/indicesLR", (131072,), "i4", chunks=(1024,), compression="gzip")
+    assert np.array_equal(frames_of(tmp_path / "a.h5"), clouds())
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["depth"] = np.full((5, 40, 50), 900, np.uint16)
+        file.create_dataset("labels", (5,), "i4")
+    depth, beside = archived_depth(tmp_path / "c.h5")
+    assert depth.shape == (5, 40, 50) and not beside
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("points", (6, 40, 3), "f4")
+    run = told("prepare", "clouds", tmp_path / "b.h5", "-o", tmp_path / "b.out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert run.returncode == 3 and "/points claims 720 values" in run.stderr
+
+
+@pytest.mark.parametrize("name", ["_FillValue", "missing_value"])
+@pytest.mark.parametrize("mark", [-1.0, 2.5, -999.0, 1e20])
+def test_values_that_attributes_declare_missing_are_no_places(tmp_path, name, mark):
+    """On one axis, too, and whatever number stands for them; whole numbers of depth and color keep theirs."""
+    stored = clouds()
+    stored[:, 7], stored[2, 9, 1] = mark, mark
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"], file["depth"] = stored, np.full((6, 4, 4), 65535, np.uint16)
+        file["points"].attrs[name] = np.float32(mark)
+        file["depth"].attrs[name] = np.uint16(65535)
+    expected = [np.delete(cloud, [7, 9] if t == 2 else [7], axis=0) for t, cloud in enumerate(clouds())]
+    found = frames_of(tmp_path / "a.h5")
+    assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+    with open_arrays(tmp_path / "a.h5") as arrays:
+        assert arrays["depth"].dtype == np.uint16 and (arrays["depth"][()] == 65535).all()
+
+
+def test_a_filter_that_is_missing_is_named(tmp_path):
+    """As PyTables packs with Blosc; what isn't packed so is read."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plist.set_chunk((6, 40, 3))
+        plist.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)
+        space = h5py.h5s.create_simple((6, 40, 3))
+        packed = h5py.h5d.create(file.id, b"points", h5py.h5t.IEEE_F32LE, space, dcpl=plist)
+        packed.write_direct_chunk((0, 0, 0), clouds().tobytes())
+        file["plain"] = clouds()
+    with open_arrays(tmp_path / "a.h5") as arrays:
+        assert np.array_equal(arrays["plain"][()], clouds())
+        with pytest.raises(DataError, match=r"/points was packed by .*\(HDF5 filter 32001\), which is missing here"):
+            arrays["points"][()]
+
+
+@pytest.mark.parametrize("form", ["PyTables", "pandas", "NumPy"])
+def test_tables_of_named_columns_are_told_from_arrays(tmp_path, form):
+    table = np.zeros(50, [("frame", "i4"), ("x", "f4"), ("y", "f4"), ("z", "f4")])
+    path = tmp_path / ("a.npy" if form == "NumPy" else "a.h5")
+    if form == "NumPy":
+        np.save(path, table)
+    else:
+        with h5py.File(path, "w") as file:
+            if form == "PyTables":
+                file["points"] = table
+            else:
+                file["df/block0_values"] = np.zeros((50, 3))
+                file["df"].attrs["pandas_type"] = "frame"
+    words = ("prepare", "clouds", path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    for options, said in (([], "holds a table"), (["--frame-column", "frame"], "need it as .csv or .parquet")):
+        run = told(*words, *options)
+        assert run.returncode == 3 and said in run.stderr and "--frame-column" in run.stderr
