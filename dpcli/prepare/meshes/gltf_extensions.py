@@ -88,17 +88,21 @@ def instances(file: Gltf, node: int) -> np.ndarray | None:
 
 
 def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:
-    """Decodes a primitive's block, if it has one, so that its accessors give what it holds.
+    """Decodes a primitive's block, if it has one, so that its accessors give what it holds until the next one is read.
 
+    Primitives may share an accessor, as Blender's do for equal triangles, but each block has its own order of vertices.
     Raises DataError when the block is damaged or lacks what it should hold.
     """
     block = primitive.get("extensions", {}).get("KHR_draco_mesh_compression")
-    if block is None or primitive.get("indices") in file.decoded:
+    file.decoded = {}
+    if block is None:
         return
     import DracoPy
 
     try:
-        mesh = DracoPy.decode(file.view_bytes(block["bufferView"]))
+        if (view := block["bufferView"]) not in file.blocks:  # nodes may share a mesh
+            file.blocks[view] = DracoPy.decode(file.view_bytes(view))
+        mesh = file.blocks[view]
         found = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
         arrays = {primitive["attributes"][key]: found[wanted] for key, wanted in block["attributes"].items()}
         if "indices" in primitive:
@@ -106,5 +110,4 @@ def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:
     except (DracoPy.FileTypeException, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         problem = f"{type(error).__name__}: {error}"
         raise file.fail(f"{where}: its Draco block cannot be decoded ({problem}); export the file again") from None
-    for index, values in arrays.items():
-        file.decoded[index] = values.reshape(len(values), -1)
+    file.decoded = {index: values.reshape(len(values), -1) for index, values in arrays.items()}
