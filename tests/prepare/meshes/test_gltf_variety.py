@@ -215,6 +215,17 @@ def test_matrices_written_row_by_row_are_refused(tmp_path, what, transposed):
 # instances
 
 
+@pytest.mark.parametrize("far", [1e3, 4e5, 1e7])
+def test_a_model_on_a_map_is_as_sharp_as_one_at_the_origin(tmp_path, far):
+    near = normalized(load_animation(arm(smooth=True).write(tmp_path / "m.glb"), None, 5), 1.0)
+    file = arm(smooth=True)
+    file.tree["nodes"][0]["translation"] = [far, 5 + far, -far]
+    mesh = load_animation(file.write(tmp_path / "m.glb"), None, 5)
+    moved = normalized(mesh, 1.0)
+    np.testing.assert_allclose(moved.positions, near.positions, atol=1e-6)
+    np.testing.assert_allclose(moved.bone_pose[:, 1:3], near.bone_pose[:, 1:3], atol=1e-6)
+
+
 def test_instances_are_drawn_where_they_stand(tmp_path, capsys):
     file = quad()
     quarter = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
