@@ -569,6 +569,30 @@ def named(*names: str) -> GlbFile:
     return file
 
 
+@pytest.mark.parametrize(
+    ("node", "path", "values", "told"),
+    [
+        (1, "translation", [[0, 0, 0], [0, 0, 1]], True),  # an object of its own
+        (1, "translation", [[0, 0, 0], [0, 0, 0]], False),  # a clip that keeps it where it is
+        (0, "rotation", [[0, 0, 0, 1], [0, 1, 0, 0]], True),  # the same object, another property
+        (0, "translation", [[0, 0, 0], [0, 0, 1]], False),  # another clip of the same object, as walk and run are
+        (2, "translation", [[0, 0, 0], [0, 0, 1]], False),  # a camera
+    ],
+)
+def test_objects_that_another_clip_moves_stand_still_and_are_told(tmp_path, capsys, node, path, values, told):
+    file = quad(shift=1.0)
+    file.tree["nodes"] += [{"name": "other", "mesh": 0, "translation": [3, 0, 0]}, {"name": "camera", "camera": 0}]
+    file.tree["scenes"][0]["nodes"] = [0, 1, 2]
+    sampler = {"input": file.add([0.0, 1.0]), "output": file.add(values)}
+    channel = {"sampler": 0, "target": {"node": node, "path": path}}
+    file.tree["animations"].append({"name": "Second", "channels": [channel], "samplers": [sampler]})
+    path = file.write(tmp_path / "m.glb")
+    for clip, other in ((None, "'Second'"), ("Second", "'Rig|Bend'")):
+        load_animation(path, clip, 2)
+        assert ("stands still in" in (said := capsys.readouterr().err)) == (told or (node != 0 and clip == "Second"))
+        assert other in said or not told
+
+
 def test_one_odd_clip_does_not_end_the_others(tmp_path, capsys):
     file = named("good", "empty", " ", "broken")
     clips = file.tree["animations"]
