@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.store import CloudsReader
 from dpcli.store.views import ViewsReader
@@ -264,3 +265,15 @@ def test_colors_of_vertices_are_read(tmp_path: Path) -> None:
     cloud = read_cloud(tmp_path / "a.obj")
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(cloud.color, [[1, 0, 0], [0, 0.5, 1]])
+
+
+def test_colors_that_only_some_objects_of_a_file_have_are_left_out_and_counted(tmp_path: Path) -> None:
+    file = tmp_path / "a.obj"
+    file.write_text("o ball\nv 1 2 3 1 0 0\nv 4 5 6 0 0.5 1\nf 1 2 1\no cube\nv 7 8 9\nf 3 3 3\n")
+    cloud = read_cloud(file)
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    assert cloud.color is None
+    assert list(cloud.dropped.values()) == [2]
+    file.write_text("v 1 2 3 1 0 0\nv 4 5 6 0 0.5 1\nv 7 8 9")
+    with pytest.raises(DataError, match="no rows of as many numbers each; truncated"):
+        read_cloud(file)
