@@ -41,6 +41,7 @@ _UNSEEN = {  # what they say does not change a picture
     "VRMC_vrm",
 }
 _ADVICE = {"KHR_texture_basisu": "export its textures as PNG or JPEG"}
+_METHOD, _EDGEBREAKER = 8, 1  # the byte of a Draco block that names its encoding, and the one that keeps no order
 _IDENTITY = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
 
 
@@ -101,7 +102,12 @@ def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:
 
     try:
         if (view := block["bufferView"]) not in file.blocks:  # nodes may share a mesh
-            file.blocks[view] = DracoPy.decode(file.view_bytes(view))
+            file.blocks[view] = DracoPy.decode(data := file.view_bytes(view))
+            if primitive.get("targets") and data[_METHOD] == _EDGEBREAKER:
+                log.warn(
+                    f"{file.path}: {where}: its Draco block changed the order of its vertices, so that its morph targets move"
+                    " the wrong ones; export it without Draco, or with Draco's sequential encoding"
+                )
         mesh = file.blocks[view]
         found = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
         arrays = {primitive["attributes"][key]: found[wanted] for key, wanted in block["attributes"].items()}

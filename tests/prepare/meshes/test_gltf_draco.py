@@ -84,6 +84,16 @@ def test_blocks_that_share_their_indices_keep_their_own_vertices(tmp_path_factor
     np.testing.assert_allclose(corners(found), corners(plain), atol=2e-3)
 
 
+@pytest.mark.parametrize("preserve_order", [True, False])
+def test_morph_targets_of_another_order_of_vertices_are_told(tmp_path, capsys, preserve_order):
+    file = arm()
+    primitive = file.tree["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": file.add(np.zeros((10, 3)))}]
+    compressed(file, preserve_order=preserve_order, compression_level=7)
+    load_animation(file.write(tmp_path / "m.glb"), None, 2)
+    assert ("changed the order of its vertices" in capsys.readouterr().err) != preserve_order
+
+
 def test_damaged_blocks_get_a_sentence(tmp_path):
     file = compressed(arm())
     block = file.tree["meshes"][0]["primitives"][0]["extensions"]["KHR_draco_mesh_compression"]
