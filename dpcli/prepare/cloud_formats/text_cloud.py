@@ -32,6 +32,8 @@ BLOCKS = "texts whose rows stand in blocks between empty lines, each read as one
 COUNTED = (
     "texts whose column {0!r} counts up, as numbers of frames do; if each text is a recording, give --frame-column {0}"
 )
+UNCOLORED = "colors of vertices left out, since other vertices of the same file have none"
+_COLORED = (6, 7)  # numbers of a vertex in an OBJ: x y z red green blue, and alpha
 _TELLING = 10  # rows that tell what columns without names hold
 _COUNTING = 256  # rows in which a column counts frames: scans sorted by ring have more points in each
 _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
@@ -72,6 +74,11 @@ def read_vertices(path: Path, keep: Sequence[str] = ()) -> Cloud:
     rows = [words[1:] for words in found if words[0] == "v"] if is_obj else _rows_of_off(path, found)
     if is_obj and not rows:
         raise DataError(f"{path}: no vertices (lines such as v 0.1 0.2 0.3)")
+    colors = sum(len(row) in _COLORED for row in rows) if is_obj else 0
+    places = sum(len(row) == len("xyz") for row in rows)
+    cut = places == 1 and len(rows[-1]) == len("xyz") and found[-1][0] == "v"
+    mixed = 0 < colors < len(rows) == colors + places and not cut  # of several objects, as Blender writes them
+    rows = [row[: len("xyz")] for row in rows] if mixed else rows
     try:
         values = np.array(rows, np.float64).reshape(len(rows), len(rows[0]) if rows else len("xyz"))
     except ValueError:
@@ -79,9 +86,10 @@ def read_vertices(path: Path, keep: Sequence[str] = ()) -> Cloud:
             f"{path}: its vertices are no rows of as many numbers each; truncated, or with decimal commas?"
         ) from None
     require_columns(path, *values.shape)
-    colored = is_obj and values.shape[1] in (6, 7)
+    colored = is_obj and values.shape[1] in _COLORED
     unread = unnamed_columns(7 if colored else 4, values.shape[1])
-    return Cloud(values[:, :3], values[:, 3:6] if colored else None, unread=unread)
+    lost = {UNCOLORED: colors} if mixed else {}
+    return Cloud(values[:, :3], values[:, 3:6] if colored else None, unread=unread, dropped=lost)
 
 
 def _rows_of_off(path: Path, found: list[list[str]]) -> list[list[str]]:

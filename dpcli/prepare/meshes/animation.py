@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import file_names
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
@@ -12,7 +13,7 @@ from dpcli.prepare.meshes.filming import Filming, film
 from dpcli.prepare.meshes.gltf import Gltf, read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
-from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
+from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, clips_apart, read_clip
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import file_digest
@@ -64,6 +65,13 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
         chosen, names = choose_clip(file, clip), clip_names(file)
         if clip is None and len(names) > 1:
             log.info(f"{path}: clip {names[0]!r}, the first of {len(names)}; --list names them, --clip chooses")
+        if apart := clips_apart(file, chosen):
+            others = ", ".join(map(repr, apart[:3])) + (f" and {len(apart) - 3} more" if len(apart) > 3 else "")
+            log.warn(
+                f"{path}: what {counted(len(apart), 'other clip')} ({others}) {'moves' if len(apart) == 1 else 'move'} stands "
+                f"still in {names[chosen]!r}; if they belong together, export them as one (in Blender: Animation mode "
+                "'Active actions merged', or 'Scene' without 'Split Animation by Object')"
+            )
         return bake(file, chosen, frames)
 
 

@@ -41,9 +41,9 @@ _UNPACKED = 4096  # bytes that one of compressed data may make
 class Gltf:
     """Holds a glTF file: its JSON and, read when asked for, its buffers.
 
-    `accessor` decodes numbers, `image` gives a texture's encoded bytes; decoded: what accessors (by index) hold that a
-    compressed block gave, (count, components). All errors are DataErrors that name the file. root: the folder that the files
-    which it names must lie in, None for any.
+    `accessor` decodes numbers, `image` gives a texture's encoded bytes; decoded: what accessors (by index) hold that the
+    compressed block of the primitive being read gave, (count, components); blocks: what such blocks hold, by buffer view.
+    All errors are DataErrors that name the file. root: the folder that the files which it names must lie in, None for any.
     """
 
     path: Path
@@ -51,6 +51,7 @@ class Gltf:
     binary: bytes | None = None
     root: Path | None = None
     decoded: dict[int, np.ndarray] = field(default_factory=dict)
+    blocks: dict[int, Any] = field(default_factory=dict)
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def fail(self, problem: str) -> DataError:

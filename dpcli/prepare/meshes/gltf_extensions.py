@@ -41,6 +41,7 @@ _UNSEEN = {  # what they say does not change a picture
     "VRMC_vrm",
 }
 _ADVICE = {"KHR_texture_basisu": "export its textures as PNG or JPEG"}
+_METHOD, _EDGEBREAKER = 8, 1  # the byte of a Draco block that names its encoding, and the one that keeps no order
 _IDENTITY = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
 
 
@@ -88,17 +89,26 @@ def instances(file: Gltf, node: int) -> np.ndarray | None:
 
 
 def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:
-    """Decodes a primitive's block, if it has one, so that its accessors give what it holds.
+    """Decodes a primitive's block, if it has one, so that its accessors give what it holds until the next one is read.
 
+    Primitives may share an accessor, as Blender's do for equal triangles, but each block has its own order of vertices.
     Raises DataError when the block is damaged or lacks what it should hold.
     """
     block = primitive.get("extensions", {}).get("KHR_draco_mesh_compression")
-    if block is None or primitive.get("indices") in file.decoded:
+    file.decoded = {}
+    if block is None:
         return
     import DracoPy
 
     try:
-        mesh = DracoPy.decode(file.view_bytes(block["bufferView"]))
+        if (view := block["bufferView"]) not in file.blocks:  # nodes may share a mesh
+            file.blocks[view] = DracoPy.decode(data := file.view_bytes(view))
+            if primitive.get("targets") and data[_METHOD] == _EDGEBREAKER:
+                log.warn(
+                    f"{file.path}: {where}: its Draco block changed the order of its vertices, so that its morph targets move"
+                    " the wrong ones; export it without Draco, or with Draco's sequential encoding"
+                )
+        mesh = file.blocks[view]
         found = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
         arrays = {primitive["attributes"][key]: found[wanted] for key, wanted in block["attributes"].items()}
         if "indices" in primitive:
@@ -106,5 +116,4 @@ def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:
     except (DracoPy.FileTypeException, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         problem = f"{type(error).__name__}: {error}"
         raise file.fail(f"{where}: its Draco block cannot be decoded ({problem}); export the file again") from None
-    for index, values in arrays.items():
-        file.decoded[index] = values.reshape(len(values), -1)
+    file.decoded = {index: values.reshape(len(values), -1) for index, values in arrays.items()}

@@ -28,6 +28,7 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _STILL = Clip("still", 0.0, 0.0, {})
 _BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
+_FAR = 100.0  # times as far from the origin as the model is large
 _MOST_VERTICES = 20_000_000  # of all instances of a node
 
 
@@ -53,7 +54,7 @@ class _Piece:
 
 def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     """Bakes the scene's triangles at `frames` times of a clip (None: as it stands); time counts from 0. Bones are the
-    file's nodes.
+    file's nodes. A model far from the origin is moved there.
 
     What has no skin hangs on its node. Points and lines are passed over. What is hidden at a time is a point then.
     Raises DataError when the file is broken.
@@ -69,6 +70,9 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         raise file.fail("has no triangles in its scene; expected a mesh with an animation")
     used = sorted({piece.material for piece in pieces})
     moved = [_move(file, piece, curves, time, poses) for piece in pieces]
+    if (shift := _middle_far_away([positions for positions, _ in moved])) is not None:
+        poses[..., :3, 3] -= shift
+        moved = [_move(file, piece, curves, time, poses) for piece in pieces]
     for piece, (positions, _) in zip(pieces, moved):
         hidden = ~shown[:, piece.node]
         positions[hidden] = positions[hidden, :1]
@@ -109,6 +113,16 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         if culled.any() and turned.any()
         else None,
     )
+
+
+def _middle_far_away(positions: list[np.ndarray]) -> np.ndarray | None:
+    """Returns the middle f64 (3) of pieces (T,V,3) that lie so far from the origin, as on maps, that 32 bits blur them; else None."""
+    low, high = (np.stack([end(x, axis=(0, 1)) for x in positions]).astype(np.float64) for end in (np.min, np.max))
+    low, high = low.min(0), high.max(0)
+    if not np.isfinite([low, high]).all():
+        return None
+    middle = (low + high) / 2
+    return middle if np.abs(middle).max() > _FAR * (high - low).max() else None
 
 
 def shape_at_rest(file: Gltf) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.skinning import Curve, matrices
 from dpcli.runtime.progress import log
@@ -104,6 +104,46 @@ def read_clip(file: Gltf, index: int) -> Clip:
         raise file.fail(f"clip {name!r} moves nothing; choose another with --clip (see --list)")
     start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
     return Clip(name, float(start), float(end), curves, tuple(dict.fromkeys(passed)))
+
+
+def clips_apart(file: Gltf, index: int) -> list[str]:
+    """Returns the names of the clips that move something with a surface, but nothing that this clip does.
+
+    So exporters write a scene of several objects when each has an action of its own.
+    """
+    targets = [_targets(entry) for entry in file.items("animations")]
+    names, mine = clip_names(file), targets[index]
+    others = [n for n, own in enumerate(targets) if n != index and own and own.isdisjoint(mine)]
+    carriers = _carriers(file) if others else set()
+    return [names[other] for other in others if _moves_any(file, other, carriers)]
+
+
+def _targets(entry: dict[str, Any]) -> set[tuple[int | None, str | None]]:
+    """Returns all that a clip's channels change; nothing for one that is broken."""
+    try:
+        return {_target(channel.get("target", {})) for channel in entry.get("channels", [])}
+    except (TypeError, AttributeError):
+        return set()
+
+
+def _carriers(file: Gltf) -> set[int]:
+    """Returns the nodes that carry a mesh, bend one or have such nodes below them."""
+    parent = node_parents(file)
+    found = {joint for skin in file.items("skins") for joint in skin.get("joints", [])}
+    waiting = [*found, *(index for index, node in enumerate(file.items("nodes")) if "mesh" in node)]
+    while waiting:
+        found.add(index := waiting.pop())
+        waiting += [above for above in [int(parent[index])] if above >= 0 and above not in found]
+    return found
+
+
+def _moves_any(file: Gltf, index: int, nodes: set[int]) -> bool:
+    """Returns whether a clip changes one of the nodes over time; False for one that is broken."""
+    try:
+        curves = read_clip(file, index).curves
+    except DataError:
+        return False
+    return any(node in nodes and np.ptp(curve.values, axis=0).any() for (node, _), curve in curves.items())
 
 
 def _target(target: dict[str, Any]) -> tuple[int | None, str | None]:

@@ -35,6 +35,11 @@ COARSE = (
 )
 UNREAD_COLORS = "frames with colors, which are not read, as the first of all has none"
 _LISTED = 8
+_PAIRS, _MANY, _LOST = 8, 50, 0.15  # frames and points that tell, and the share of lost neighbors that is odd
+SCATTERED = (
+    "sequences whose tracked points lose their neighbors from one frame to the next; does --track give the same number to"
+    " the same point in all frames? Else leave it out"
+)
 SHIFTED = "sequences shifted to their first frame's corner for precision"
 
 
@@ -161,6 +166,7 @@ def assemble(
         extra=extra,
         **describe(item),
     )
+    notes |= {SCATTERED: 1} if _scatters([clouds[t] for t in kept]) else {}
     return Sample(sequence, notes)
 
 
@@ -175,6 +181,33 @@ def _tracks(item: Item, clouds: list[Cloud]) -> np.ndarray | None:
                 " expected one of its own for each, the same in every frame"
             )
     return np.concatenate(tracks) if tracks else None
+
+
+def _scatters(clouds: list[Cloud]) -> bool:
+    """Returns whether many tracked points are far from their nearest neighbors a frame later, as those of mixed-up rows are.
+
+    What bodies that bend, turn, grow and shrink do leaves nearly all neighbors near.
+    """
+    if any(cloud.track is None for cloud in clouds) or len(clouds) < 2:
+        return False
+    first = np.unique(np.linspace(0, len(clouds) - 2, _PAIRS).astype(int))
+    return any(_lost_neighbors(clouds[t], clouds[t + 1]) > _LOST for t in first)
+
+
+def _lost_neighbors(one: Cloud, other: Cloud) -> float:
+    """Returns the share of points whose nearest neighbor in one frame is half the cloud's size away in the other."""
+    from scipy.spatial import cKDTree
+
+    _, here, there = np.intersect1d(one.track, other.track, assume_unique=True, return_indices=True)
+    step = max(1, len(here) // _LOOKED_AT)
+    before, kept = np.unique(one.points[here[::step]].astype(np.float64), axis=0, return_index=True)
+    after = other.points[there[::step][kept]].astype(np.float64)
+    sizes = [np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()) for points in (before, after)]
+    if len(before) < _MANY or not min(sizes) > 0:
+        return 0.0
+    distance, neighbor = (found[:, 1] for found in cKDTree(before).query(before, k=2))
+    apart = np.linalg.norm(after - after[neighbor], axis=1)
+    return float((apart / sizes[1] > 0.5 + 2 * distance / sizes[0]).mean())
 
 
 def _further(clouds: list[Cloud], known: tuple[str, ...]) -> dict[str, int]:

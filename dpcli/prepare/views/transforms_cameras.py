@@ -47,6 +47,11 @@ class View:
     paths: dict[float, Path] = field(default_factory=dict)
     masks: dict[float, Path] = field(default_factory=dict)
 
+    @property
+    def has_angle_across_alone(self) -> bool:
+        """Returns whether the file says nothing of the lens but the angle across the pictures."""
+        return {"camera_angle_x"} == {key for key in self.lens if key.startswith(("camera_angle", "fl_"))}
+
     def intrinsics(self, width: int, height: int) -> np.ndarray:
         """Returns f64 (3,3) for pictures of this size, also where they were resized after the file was written.
 

@@ -65,6 +65,11 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     times = [times[index] for index in chosen]
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([view.intrinsics(*size) for view, size in zip(views, sizes, strict=True)])
+    if any(high > wide and view.has_angle_across_alone for view, (wide, high) in zip(views, sizes)):
+        log.warn(
+            f"{path}: pictures higher than wide: camera_angle_x is taken for the angle across them; Blender's angle_x is that of"
+            " the longer side, so if it was written from there, give fl_x (pixels) in its place"
+        )
     poses = np.stack([view.pose for view in views])
     up = up_of_cameras(str(path), poses) if (named := named_up(path)) is None else named
     try:

@@ -180,6 +180,21 @@ def test_frames_of_unlike_sizes(tmp_path):
         assert same(found, frames), name
 
 
+@pytest.mark.parametrize("form", ["npz", "h5", "mat"])
+@pytest.mark.parametrize("kind", ["i8", "u1", "i4"])
+def test_triangles_and_colors_without_names_are_no_frames(tmp_path, capsys, form, kind):
+    rng = np.random.default_rng(3)
+    clouds, numbers = rng.normal(size=(2, 40, 3)), rng.integers(0, 40, (70, 3)).astype(kind)
+    mesh = write(tmp_path / "mesh", form, arr_0=clouds[0], arr_1=numbers)
+    with pytest.raises(DataError, match="refused"):
+        read(mesh)
+    assert "one cloud, or none, in arr_0 (40, 3), arr_1 (70, 3)" in capsys.readouterr().err
+    clip = write(tmp_path / "clip", form, arr_0=clouds[0], arr_1=clouds[1][:30])
+    assert [len(frame) for frame in read(clip)["clip"]] == [40, 30]
+    clip = write(tmp_path / "whole", form, arr_0=numbers, arr_1=numbers[::2])
+    assert [len(frame) for frame in read(clip)["whole"]] == [70, 35]
+
+
 def test_colors_that_the_first_file_lacks_are_told(tmp_path, capsys):
     for name, more in (("a", {}), ("b", {"colors": np.zeros((5, 30, 3), np.uint8)})):
         write(tmp_path / "raw" / name, "npz", points=untracked(13, 5, 30), **more)

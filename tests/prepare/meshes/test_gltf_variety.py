@@ -215,6 +215,17 @@ def test_matrices_written_row_by_row_are_refused(tmp_path, what, transposed):
 # instances
 
 
+@pytest.mark.parametrize("far", [1e3, 4e5, 1e7])
+def test_a_model_on_a_map_is_as_sharp_as_one_at_the_origin(tmp_path, far):
+    near = normalized(load_animation(arm(smooth=True).write(tmp_path / "m.glb"), None, 5), 1.0)
+    file = arm(smooth=True)
+    file.tree["nodes"][0]["translation"] = [far, 5 + far, -far]
+    mesh = load_animation(file.write(tmp_path / "m.glb"), None, 5)
+    moved = normalized(mesh, 1.0)
+    np.testing.assert_allclose(moved.positions, near.positions, atol=1e-6)
+    np.testing.assert_allclose(moved.bone_pose[:, 1:3], near.bone_pose[:, 1:3], atol=1e-6)
+
+
 def test_instances_are_drawn_where_they_stand(tmp_path, capsys):
     file = quad()
     quarter = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
@@ -556,6 +567,30 @@ def named(*names: str) -> GlbFile:
     clip = file.tree["animations"][0]
     file.tree["animations"] = [{**clip, "name": name} for name in names]
     return file
+
+
+@pytest.mark.parametrize(
+    ("node", "path", "values", "told"),
+    [
+        (1, "translation", [[0, 0, 0], [0, 0, 1]], True),  # an object of its own
+        (1, "translation", [[0, 0, 0], [0, 0, 0]], False),  # a clip that keeps it where it is
+        (0, "rotation", [[0, 0, 0, 1], [0, 1, 0, 0]], True),  # the same object, another property
+        (0, "translation", [[0, 0, 0], [0, 0, 1]], False),  # another clip of the same object, as walk and run are
+        (2, "translation", [[0, 0, 0], [0, 0, 1]], False),  # a camera
+    ],
+)
+def test_objects_that_another_clip_moves_stand_still_and_are_told(tmp_path, capsys, node, path, values, told):
+    file = quad(shift=1.0)
+    file.tree["nodes"] += [{"name": "other", "mesh": 0, "translation": [3, 0, 0]}, {"name": "camera", "camera": 0}]
+    file.tree["scenes"][0]["nodes"] = [0, 1, 2]
+    sampler = {"input": file.add([0.0, 1.0]), "output": file.add(values)}
+    channel = {"sampler": 0, "target": {"node": node, "path": path}}
+    file.tree["animations"].append({"name": "Second", "channels": [channel], "samplers": [sampler]})
+    path = file.write(tmp_path / "m.glb")
+    for clip, other in ((None, "'Second'"), ("Second", "'Rig|Bend'")):
+        load_animation(path, clip, 2)
+        assert ("stands still in" in (said := capsys.readouterr().err)) == (told or (node != 0 and clip == "Second"))
+        assert other in said or not told
 
 
 def test_one_odd_clip_does_not_end_the_others(tmp_path, capsys):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.store import CloudsReader
 from dpcli.store.views import ViewsReader
@@ -264,3 +265,37 @@ def test_colors_of_vertices_are_read(tmp_path: Path) -> None:
     cloud = read_cloud(tmp_path / "a.obj")
     np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(cloud.color, [[1, 0, 0], [0, 0.5, 1]])
+
+
+def test_colors_that_only_some_objects_of_a_file_have_are_left_out_and_counted(tmp_path: Path) -> None:
+    file = tmp_path / "a.obj"
+    file.write_text("o ball\nv 1 2 3 1 0 0\nv 4 5 6 0 0.5 1\nf 1 2 1\no cube\nv 7 8 9\nf 3 3 3\n")
+    cloud = read_cloud(file)
+    np.testing.assert_array_equal(cloud.points, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    assert cloud.color is None
+    assert list(cloud.dropped.values()) == [2]
+    file.write_text("v 1 2 3 1 0 0\nv 4 5 6 0 0.5 1\nv 7 8 9")
+    with pytest.raises(DataError, match="no rows of as many numbers each; truncated"):
+        read_cloud(file)
+
+
+@pytest.mark.parametrize("mixed_up", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("count", [60, 1500])
+def test_rows_that_are_not_the_same_points_are_doubted(
+    mixed_up: float, count: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(count)
+    shape = rng.normal(size=(count, 3)) * [3, 1, 0.3]
+    (tmp_path / "body").mkdir()
+    for t in range(_FRAMES):  # it bends, turns, travels and grows
+        bent = shape + [0, 0, 1] * (0.1 * t * shape[:, :1] ** 2)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = 1.5**t * bent @ turn + [20 * t, 0, 0]
+        some = rng.permutation(count)[: int(mixed_up * count)]
+        points[np.sort(some)] = points[some]
+        np.save(tmp_path / "body" / f"{t}.npy", points.astype(np.float32))
+    command = ("prepare", "clouds", tmp_path / "body", "-o", tmp_path / "out.h5", "--item-seconds", "0", "--jobs", "1")
+    assert 0 == exit_code(*command, "--track", "rows")
+    assert ("lose their neighbors" in capfd.readouterr().err) == (mixed_up > 0)
+    assert 0 == exit_code(*command, "--force")
+    assert "lose their neighbors" not in capfd.readouterr().err

@@ -597,6 +597,18 @@ def blender_folder(folder: Path, cameras: int = 3, frames: int = 3, moving_camer
     return folder, poses
 
 
+@pytest.mark.parametrize(("high", "more"), [(True, {}), (True, {"fl_x": 80}), (False, {})])
+def test_an_angle_across_pictures_higher_than_wide_is_doubted(tmp_path, capsys, high, more):
+    folder, _ = blender_folder(tmp_path / "scene")
+    for file in folder.glob("train/*.png"):
+        picture = Image.open(file).convert("RGBA")
+        Image.fromarray(np.pad(np.array(picture), ((20, 20), (0, 0), (0, 0))) if high else np.array(picture)).save(file)
+    path = folder / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | more))
+    transforms_clip(folder, SMALL)
+    assert ("camera_angle_x is taken for the angle across" in capsys.readouterr().err) == (high and not more)
+
+
 def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
     folder, poses = blender_folder(tmp_path / "scene")
     assert is_transforms(folder) and not is_transforms(tmp_path)
