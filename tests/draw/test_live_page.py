@@ -38,6 +38,22 @@ def test_the_page_tells_what_was_said_at_a_frame(tmp_path, frame, told):
     assert told in said and 'id="error" class="card" role="alert" hidden' in html
 
 
+@needs_browser
+@pytest.mark.parametrize(("width", "height"), [(500, 800), (900, 400)], ids=["phone", "on its side"])
+def test_what_is_said_lies_under_no_button_and_points_keep_their_place(tmp_path, width, height):
+    """(A headless Chromium has no windows narrower than 500.)"""
+    write(tmp_path / "live.html", names=("a_name_of_one_word_that_is_long_" * 4, "bow"))
+    script = """<script>setInterval(() => {
+      const [said, home, stage] = ["said", "home", "stage"].map((id) => $(id).getBoundingClientRect());
+      root.dataset.apart = said.right <= home.left && $("said").scrollWidth <= said.width + 1 && stage.height > 150;
+    }, 200)</script></body>"""
+    text = (tmp_path / "live.html").read_text("utf-8")
+    (tmp_path / "live.html").write_text(text.replace("</body>", script), "utf-8")
+    address = f"file://{tmp_path / 'live.html'}#frame=12&play=0&renderer=2d"
+    html, _ = open_page(address, tmp_path, "--virtual-time-budget=9000", f"--window-size={width},{height}")
+    assert 'data-apart="true"' in html and ">a_name_of_one_word" in html.split('id="said"')[1]
+
+
 def test_the_page_of_an_hour_is_no_larger_than_that_of_minutes(tmp_path):
     write(tmp_path / "short.html", frames=4000)
     write(tmp_path / "long.html", frames=20_000)

@@ -14,6 +14,7 @@ from dpcli.evaluate.report.blocks import text_of
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 560, 170, 44, 34, 8
 _BINS = 20
 _DEEP = 0.55  # share from which a cell's text is drawn light
+_ON_PAPER = 18  # classes of a confusion matrix; more are printed smaller
 
 
 def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str:
@@ -105,8 +106,9 @@ def confusion_grid(confusion: np.ndarray, names: Sequence[str]) -> str:
         + "</tr>"
         for row, title in enumerate(titles)
     )
+    kind = "grid many" if len(names) > _ON_PAPER else "grid"
     return (
-        '<div class="wide" tabindex="0" role="region" aria-label="Confusion matrix"><table class="grid" data-unit="samples">'
+        f'<div class="wide" tabindex="0" role="region" aria-label="Confusion matrix"><table class="{kind}" data-unit="samples">'
         f'<thead><tr><th scope="col">truth \\ predicted</th>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
         '<p class="faint says" aria-live="polite">Point at a cell, or move among them with the arrow keys.</p>'
     )

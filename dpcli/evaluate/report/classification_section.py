@@ -9,10 +9,10 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.metric_titles import title_of
-from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, is_number, table
+from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, is_number, table, text_of
 from dpcli.evaluate.report.charts import confusion_grid
 
-SHOWN_HERE = ("streams", "per_class", "confusion")
+SHOWN_HERE = ("streams", "per_class", "confusion", "reliability")
 _MOST_CLASSES = 128
 _MOST_PAIRS = 12
 
@@ -33,6 +33,8 @@ def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
     if confusion is not None:
         names = [str(row.get("name", "")) for row in classes] or [""] * len(confusion)
         blocks += _confusion_blocks(confusion, names)
+    if isinstance(metrics.get("reliability"), Mapping):
+        blocks += _reliability_tables(metrics["reliability"])
     return blocks
 
 
@@ -107,8 +109,8 @@ def _most_confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
     support = confusion.sum(axis=1)
     rows = [
         [
-            f"{names[a] or a}",
-            f"{names[b] or b}",
+            Cell(names[a]) if names[a] else cell(a),  # a name may begin with a number, by which it is not sorted
+            Cell(names[b]) if names[b] else cell(b),
             cell(int(wrong[a, b])),
             cell(float(wrong[a, b] / support[a]), "fraction", bar=True),
         ]
@@ -124,3 +126,27 @@ def _most_confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
             key="confused",
         )
     ]
+
+
+def _reliability_tables(found: Mapping[str, Any]) -> list[Table]:
+    """Returns the table of the bins of probability that hold samples, in a list, which is empty where none does.
+
+    Raises ValueError where the bins' samples, probabilities and shares are not as many.
+    """
+    bins = list(zip(found["samples"], found["confidence"], found["accuracy"], strict=True))
+    rows = [
+        [
+            Cell(f"{k / len(bins):.2f} to {(k + 1) / len(bins):.2f}", float(k)),
+            cell(samples),
+            cell(confidence, "fraction"),
+            cell(right, "fraction", bar=True),
+        ]
+        for k, (samples, confidence, right) in enumerate(bins)
+        if samples
+    ]
+    if not rows:
+        return []
+    chance = found.get("calibration_error_by_chance")
+    note = f"As many perfectly calibrated samples would show a calibration error of {text_of(chance, 'fraction')} on average."
+    header = ("probability of the best class", "samples", "mean probability", "right")
+    return [table("Reliability", header, rows, note if is_number(chance) else "", key="reliability")]

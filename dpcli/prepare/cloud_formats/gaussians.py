@@ -41,11 +41,16 @@ def read_spz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     _refuse_kept(path, keep)
     packed = path.read_bytes()
     unpacking = zlib.decompressobj(zlib.MAX_WBITS | 16)
+    if (
+        packed.startswith(_MAGIC.to_bytes(4, "little"))
+        and max(_REST) < (version := int.from_bytes(packed[4:8], "little")) < 256
+    ):
+        raise _other_version(path, version)  # later versions are not packed as a whole, so that their head lies open
     try:
         head = unpacking.decompress(packed, _HEAD.size)
         magic, version, count, _, bits, _, _ = _HEAD.unpack(head)
         if magic != _MAGIC or version not in _REST:
-            raise DataError(f"{path}: version {version} of .spz; 1 to 3 are read, save it as .ply")
+            raise _other_version(path, version)
         width = 6 if version == 1 else 9
         needed = count * (width + _REST[version])
         if needed > _PACKED_AT_MOST * len(packed):
@@ -58,6 +63,10 @@ def read_spz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     colors = np.frombuffer(body, np.uint8, 3 * count, (width + 1) * count).reshape(-1, 3)
     color = color_of_harmonics((colors / 255 - 0.5) / _COLOR_SCALE)
     return Cloud(_centers(body, count, bits if version > 1 else None), color, unread=_UNREAD)
+
+
+def _other_version(path: Path, version: int) -> DataError:
+    return DataError(f"{path}: version {version} of .spz; 1 to 3 are read: save it as version 3, or as .ply")
 
 
 def _centers(body: bytes, count: int, bits: int | None) -> np.ndarray:

@@ -56,7 +56,14 @@ _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_mode
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
 _ABOUT_CAMERAS = "distortions?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
-_COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
+_COLMAP = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "FULL_OPENCV": 12,
+}  # how many parameters
 _MOST_NUMBERS = 64  # in an array
 _MOST_PIXELS = 1_000_000  # of a side of a picture
 _EXPECTED = (
@@ -79,7 +86,8 @@ def read_calibration(path: Path) -> Calibration:
     try:
         text = decode_text(path)
     except DataError:
-        raise DataError(f"{path}: is not text; {_EXPECTED}") from None
+        hint = "; of COLMAP's cameras.bin `colmap model_converter --output_type TXT` makes cameras.txt"
+        raise DataError(f"{path}: is not text; {_EXPECTED}{hint if path.suffix == '.bin' else ''}") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     if (cameras := _colmap_lines(text)) and path.suffix.lower() == ".txt":
@@ -255,6 +263,7 @@ def _of_colmap(path: Path, cameras: list[list[str]]) -> Calibration:
     if model.startswith("SIMPLE") or model == "RADIAL":
         values = [values[0], *values]
     fx, fy, cx, cy, *lens = values
+    lens += [0.0] * (-len(lens) % 4)  # k1, or k1 and k2, without p1 and p2, which OpenCV wants beside them
     corner = [fx, fy, cx - 0.5, cy - 0.5]  # COLMAP counts from the corner of the first pixel, not from its center
     return Calibration(_intrinsics(path, corner, tuple(lens)), *_pixel_counts(path, width, height), source=str(path))
 

@@ -9,6 +9,7 @@ from typing import Any
 from dpcli.errors import DataError
 
 _MOST_BYTES = 1 << 20
+_DEEPEST = 5  # entries within one another
 _ROW = r"[ \t]*\n\s*".join([r"[-+.\deE \t]+"] * 3)
 _OST_MATRIX = re.compile(rf"^camera matrix\s*\n\s*({_ROW})", re.MULTILINE | re.IGNORECASE)
 _OST_LINE = re.compile(r"^(width|height|distortion)\s*\n([-+.\deE \t]+)$", re.MULTILINE | re.IGNORECASE)
@@ -37,14 +38,14 @@ def mapping_of_xml(path: Path, text: str) -> dict[str, Any]:
     return {node.tag: _of_node(node) for node in root}
 
 
-def _of_node(node: Any) -> Any:
-    """Returns a matrix, a mapping of the plain entries below, a list of numbers, a number, or the text."""
-    below = {child.tag: child.text or "" for child in node if not len(child)}
-    if "data" in below:
-        numbers = _numbers(below["data"])
-        return {"data": below["data"] if numbers is None else numbers}
-    if below:
-        return {tag: _number_or_text(text) for tag, text in below.items()}
+def _of_node(node: Any, depth: int = 0) -> Any:
+    """Returns a matrix, a mapping of the entries below, a list of numbers, a number, or the text."""
+    data = node.find("data")
+    if data is not None:
+        numbers = _numbers(data.text or "")
+        return {"data": data.text or "" if numbers is None else numbers}
+    if len(node) and depth < _DEEPEST:
+        return {child.tag: _of_node(child, depth + 1) for child in node}
     return _number_or_text(node.text or "")
 
 

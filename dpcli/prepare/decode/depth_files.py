@@ -42,6 +42,7 @@ _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: of more than 4 GB
 _PHOTOMETRIC = 262  # the tag of TIFF that says so
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
@@ -242,6 +243,11 @@ def read_image(path: Path) -> np.ndarray:
         return image
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
+    if not pages and data.startswith(_TIFF):
+        raise DataError(
+            f"{path}: a TIFF that is damaged, or whose compression or type of number isn't read; save it uncompressed or with LZW"
+            " or deflate, in whole numbers of 16 or 32 bits or float32"
+        )
     if not pages:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
     if len(pages) > 1:  # which of them is the frame?

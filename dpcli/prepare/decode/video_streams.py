@@ -10,6 +10,7 @@ from pathlib import Path
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips.container_ends import VIDEO_FORMATS
+from dpcli.runtime.clips.display_matrix import display_matrix
 
 _STREAM = re.compile(r"\s*Stream #0:\d+.*?: (Video|Audio|Subtitle|Data|Attachment): (.*)")
 _TITLE = re.compile(r"\s+(?:title|handler_name)\s*: (.*)")
@@ -87,6 +88,8 @@ def video_streams(path: Path) -> list[VideoStream]:
 def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool, int]:
     """Returns whether the first frame of a video stream is interlaced, or ``every`` one was asked for and some is, and by how many
     quarters counterclockwise the first is turned where it is shown; (False, 0) where PyAV can't read it.
+
+    Raises DataError where it is shown mirrored: which of the two the camera saw, no file says, and space would be mirrored, too.
     """
     import av
 
@@ -96,9 +99,15 @@ def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool,
             frames = container.decode(video=place)
             first = next(frames)
             woven = bool(first.interlaced_frame) or (every and any(frame.interlaced_frame for frame in frames))
-            return woven, round(first.rotation / 90) % 4
+            turned, (a, b, c, d) = round(first.rotation / 90) % 4, display_matrix(first)
     except (av.FFmpegError, OSError, ValueError, IndexError, StopIteration):
         return False, 0
+    if a * d < b * c:
+        raise DataError(
+            f"{path}: says that it is shown mirrored; expected the camera's own picture, which is as a rule the stored one: ffmpeg"
+            f" -display_rotation 0 -i {path.name} -c copy depth{path.suffix}"
+        )
+    return woven, turned
 
 
 def _parsed(place: int, text: str) -> VideoStream:

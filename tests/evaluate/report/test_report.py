@@ -26,7 +26,7 @@ from dpcli.evaluate.report import arrange, collect, report_html, report_latex, r
 from dpcli.evaluate.report.blocks import Table, interval_text, sort_key, table, text_of
 from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
 from dpcli.evaluate.report.markdown_and_latex import escape_latex
-from dpcli.store import CloudSequence, CloudsWriter, PartsWriter
+from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
 from tests.support.report_helpers import EVIL
 
@@ -87,6 +87,23 @@ def test_the_page_has_the_numbers_of_the_command(scores, parts, truth, page):
     assert sorted(int(count) for _, count in cells) == counts
     assert "dpc prepare msraction3d RAW" in words and "dpc segment predict" in words
     assert "worst: bad, frame" in words and "End-point error of the frame pairs (meter)" in words
+
+
+def test_the_page_shows_how_reliable_probabilities_are(tmp_path):
+    """Of four samples that are said with 0.9, three are right; class names that begin with numbers are words."""
+    names = ["2 hands", "10 hands"]
+    with ScoresWriter(tmp_path / "s.h5", class_names=names, provenance=[]) as writer:
+        for index in range(4):
+            writer.write(f"v{index}", np.array([0.9, 0.1]), label=int(index == 3), split="test")
+    (section,) = arrange(collect([str(tmp_path / "s.h5")])).sections
+    tables = {block.title: block for block in section.blocks if isinstance(block, Table)}
+    assert [[own.text for own in row] for row in tables["Reliability"].rows] == [
+        ["0.87 to 0.93", "4", "90.0 %", "75.0 %"]
+    ]
+    assert re.search(r"calibration error of \d+\.\d % on average", tables["Reliability"].note)
+    assert section.notes == []
+    (confused,) = [own for title, own in tables.items() if title.startswith("Confused most")]
+    assert [(own.text, own.sort) for own in confused.rows[0][:2]] == [("10 hands", None), ("2 hands", None)]
 
 
 def test_files_and_their_json_make_the_same_sections(scores, folder):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.depth import DepthVideos, background_depth
@@ -121,6 +122,16 @@ def test_a_video_of_a_color_map_is_no_depth_and_gray_ones_are(tmp_path):
                     read_video(tmp_path / name)
             else:
                 assert len(read_video(tmp_path / name)[0]) == 6
+
+
+@pytest.mark.parametrize("compression", ["lzma", "zstd", "cut"])
+def test_a_tiff_that_opencv_cannot_read_is_named(tmp_path, compression):
+    path = tmp_path / "one.tif"
+    frame = Image.fromarray(np.arange(600, dtype=np.uint16).reshape(20, 30))
+    frame.save(path, compression=None if compression == "cut" else compression)
+    path.write_bytes(path.read_bytes()[: 300 if compression == "cut" else None])
+    with pytest.raises(DataError, match="one.tif: a TIFF that is damaged, or whose compression .* LZW or deflate"):
+        read_image(path)
 
 
 def test_a_tiff_of_several_pages_is_refused(tmp_path):

@@ -102,6 +102,11 @@ def test_gaussians_that_supersplat_packed(tmp_path, tinted, order):
         ("a.splat", bytes(33), "no whole number of Gaussians"),
         ("a.splat", b"\xff" * 64, "no .splat"),
         ("a.spz", b"NGSP" * 9, "not a readable .spz"),
+        (
+            "a.spz",
+            struct.pack("<IIIBBBB", 0x5053474E, 4, 1, 0, 12, 0, 5) + bytes(99),
+            "version 4 .* as version 3, or as .ply",
+        ),
         ("a.spz", gzip.compress(b"NGSP"), "not a readable .spz"),
         ("a.spz", gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 4, 1, 0, 12, 0, 0)), "version 4"),
         ("a.spz", gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, 1 << 30, 0, 12, 0, 0)), "can't hold"),
@@ -112,7 +117,17 @@ def test_gaussians_that_supersplat_packed(tmp_path, tinted, order):
         ),
         ("a.spz", spz(*scene(40, 0), 2)[:-60], "truncated|not a readable"),
     ],
-    ids=["odd length", "not finite", "unpacked", "no head", "version", "count", "short", "cut"],  # gzip holds the time
+    ids=[
+        "odd length",
+        "not finite",
+        "unpacked",
+        "version in the open",
+        "no head",
+        "version",
+        "count",
+        "short",
+        "cut",
+    ],  # gzip holds the time
 )
 def test_damaged_gaussians_are_named(tmp_path, name, data, told):
     (tmp_path / name).write_bytes(data)

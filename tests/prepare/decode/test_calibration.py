@@ -429,6 +429,38 @@ def test_every_form_of_opencvs_storage_tells_the_same(tmp_path, matrix, suffix):
     assert found.intrinsics.distortion == pytest.approx((0.1, -0.2, 0.001, 0.002, 0.03))
 
 
+@pytest.mark.parametrize("suffix", ["xml", "yml", "json"])
+def test_the_depth_camera_beside_another_in_opencvs_files(tmp_path, suffix):
+    storage = cv2.FileStorage(str(tmp_path / f"c.{suffix}"), cv2.FILE_STORAGE_WRITE)
+    for name, scale in (("depth", 1.0), ("color", 2.0)):
+        storage.startWriteStruct(name, cv2.FileNode_MAP)
+        storage.write("camera_matrix", scale * np.array(NESTED))
+        storage.write("distortion_coefficients", np.array([0.1, -0.2, 0.001, 0.002, 0.03]))
+        storage.endWriteStruct()
+    storage.release()
+    found = read_calibration(tmp_path / f"c.{suffix}").intrinsics
+    assert found == LensIntrinsics(FX, FY, CX, CY, (0.1, -0.2, 0.001, 0.002, 0.03))
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
+def test_lenses_of_colmap_send_rays_back_to_their_pixels(tmp_path, model):
+    """What COLMAP does with a ray: x (1 + k1 r^2 + ...) / (1 + k4 r^2 + ...) + 2 p1 x y + p2 (r^2 + 2 x^2), and so y."""
+    given = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8}[model]
+    lens = [0.08, -0.05, 0.002, -0.001, 0.02, 0.01, -0.02, 0.004][:given]
+    focal = [FX] if given < 4 else [FX, FY]
+    words = [1, model, 640, 480, *focal, CX + 0.5, CY + 0.5, *lens]
+    (tmp_path / "cameras.txt").write_text("# COLMAP\n" + " ".join(map(str, words)) + "\n")
+    rays = pixel_rays(480, 640, read_calibration(tmp_path / "cameras.txt").intrinsics).astype(np.float64)
+    x, y = rays[:, 0], rays[:, 1]
+    k1, k2, p1, p2, k3, k4, k5, k6 = [*lens, *[0.0] * 8][:8]
+    r2 = x**2 + y**2
+    factor = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    u = FX * (x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + CX
+    v = focal[-1] * (y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y**2)) + CY
+    rows, columns = np.divmod(np.arange(480 * 640), 640)
+    np.testing.assert_allclose(np.stack([u, v]), np.stack([columns, rows]), atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [

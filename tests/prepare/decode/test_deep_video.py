@@ -187,6 +187,32 @@ def test_pictures_are_turned_as_they_are_shown(tmp_path, name):
     assert read_depth_video(tmp_path / f"plain_{name}").notes == {}
 
 
+@pytest.mark.parametrize(("bits", "name"), [(8, "a.mp4"), (16, "a.mkv")])
+@pytest.mark.parametrize("how", [["-display_hflip"], ["-display_vflip"], ["-display_hflip", "-display_rotation", "90"]])
+def test_mirrored_videos_are_refused_and_the_advice_helps(tmp_path, bits, name, how):
+    """They were turned by half a turn."""
+    frames = frames_of(bits).astype(np.uint8 if bits == 8 else np.uint16)
+    encode(tmp_path / f"plain_{name}", frames, "gray" if bits == 8 else "gray16le", "ffv1")
+    command = [get_ffmpeg_exe(), "-v", "error"]
+    subprocess.run(
+        [*command, *how, "-i", str(tmp_path / f"plain_{name}"), "-c", "copy", str(tmp_path / name)], check=True
+    )
+    with pytest.raises(DataError, match=f"shown mirrored.*ffmpeg -display_rotation 0 -i {name} -c copy depth"):
+        read_depth_video(tmp_path / name)
+    advised = [
+        *command,
+        "-display_rotation",
+        "0",
+        "-i",
+        str(tmp_path / name),
+        "-c",
+        "copy",
+        str(tmp_path / f"b_{name}"),
+    ]
+    subprocess.run(advised, check=True)
+    np.testing.assert_array_equal(read_depth_video(tmp_path / f"b_{name}").frames, frames)
+
+
 def test_interlaced_frames_are_refused_and_the_advice_helps(tmp_path):
     """OpenCV 5 gives other numbers in their place, and no error."""
     frames = frames_of(16)

@@ -86,6 +86,25 @@ def test_openexr_of_every_lossless_packing(tmp_path, kind, packed, tiled):
     np.testing.assert_array_equal(read_frame(tmp_path / "a.exr"), frame)
 
 
+def test_openexr_of_several_parts_and_with_an_alpha_that_comes_first(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    frame = np.random.default_rng(0).uniform(1, 2, (6, 8)).astype(np.float32)
+    ones = np.ones((6, 8), np.float32)
+    openexr.File(dict(header), {name: ones if name == "A" else frame for name in "ABGR"}).write(
+        str(tmp_path / "gray.exr")
+    )
+    np.testing.assert_array_equal(read_frame(tmp_path / "gray.exr"), frame)
+    for channel, name in (("Z", "far"), ("Y", "depth")):
+        parts = [openexr.Part(dict(header), {"Y": ones}, "mask"), openexr.Part(dict(header), {channel: frame}, name)]
+        openexr.File(parts).write(str(tmp_path / "parts.exr"))
+        np.testing.assert_array_equal(read_frame(tmp_path / "parts.exr"), frame)
+    parts = [openexr.Part(dict(header), {"Y": one}, name) for one, name in ((ones, "a"), (frame, "b"))]
+    openexr.File(parts).write(str(tmp_path / "which.exr"))
+    with pytest.raises(DataError, match=r"which.exr: holds channels a\.Y, b\.Y; expected one called Z or depth"):
+        read_frame(tmp_path / "which.exr")
+
+
 @pytest.mark.parametrize("kind", ["u1", "<u2", ">u2", "<i2", ">i4", "<u4", "f2", "<f4", ">f8"])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_arrays_of_numpy(tmp_path, kind, order):

@@ -99,11 +99,13 @@ class LivePage extends PointsPage {
     pen.font = "12px system-ui, sans-serif";
     pen.textBaseline = "middle";
     let top = 16;
-    const title = (text) => { pen.fillStyle = faint; pen.fillText(text, LEFT, top - 9); };
+    const fits = (text) => pen.measureText(text).width < this.lanes.clientWidth - 2 * LEFT;
+    const title = (text, short = text) => { pen.fillStyle = faint; pen.fillText(fits(text) ? text : short, LEFT, top - 9); };
     title("actions");
     for (const [start, end, name] of this.live.segments) this.paintAction(pen, top, this.x(start), this.x(end), name, line, ink);
     top += ACTIONS + SPACE + 14;
-    title(`confidence, as it was said${this.live.threshold ? `; below ${this.live.threshold.toFixed(2)} nothing happens` : ""}`);
+    const below = this.live.threshold ? `; below ${this.live.threshold.toFixed(2)} nothing happens` : "";
+    title(`confidence, as it was said${below}`, `confidence${below}`);
     this.paintSure(pen, top, line);
     top += SURE + SPACE + 14;
     title(`latency, at most ${Math.max(...this.live.latency).toFixed(0)} ms`);

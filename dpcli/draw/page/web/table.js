@@ -7,6 +7,8 @@ const KEYS = [
   ["click", "a column sorts; a row shows its best classes, as Enter does"],
 ];
 
+const LONG = 40;  // letters of a name, from which on it has several lines
+
 class ScoresPage {
   constructor(header) {
     Object.assign(this, { header, sort: null, down: false, which: "all", search: "" });
@@ -21,7 +23,7 @@ class ScoresPage {
   // Of each column its title, what a row is sorted by, and what its cell shows.
   columnsOf(named) {
     const { header } = this, labeled = this.rows.some((row) => row.label >= 0), split = this.rows.some((row) => row.split);
-    const text = (value) => made("td", value), word = header.probabilities ? "probability" : "score";
+    const text = (value) => made("td", value, value.length > LONG ? { class: "long" } : {}), word = header.probabilities ? "probability" : "score";
     const verdict = (right) => made("td", right === null ? "–" : right ? "right" : "wrong", { class: right === null ? "" : right ? "right" : "wrong" });
     const streams = header.streams.map((stream, k) => ({
       title: stream, key: (row) => named(row.streams[k][0]),
@@ -48,7 +50,7 @@ class ScoresPage {
   }
 
   scored(name, score, wrong) {
-    const cell = made("td", name, wrong ? { class: "wrong" } : {});
+    const cell = made("td", name, { class: `${wrong ? "wrong" : ""} ${name.length > LONG ? "long" : ""}`.trim() });
     cell.append(made("small", this.shown(score)));
     return cell;
   }
