@@ -20,7 +20,7 @@ from dpcli.runtime.worker_server import ensure_server
 
 if __name__ == "__main__":
     seen = []
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):
         signal.signal(number, lambda number, frame: seen.append(number))
     ensure_server("slow_import")
     while not seen:
@@ -29,7 +29,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
 def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Path, number: int) -> None:
     (tmp_path / "slow_import.py").write_text(SLOW)
     (tmp_path / "program.py").write_text(PROGRAM)
