@@ -39,6 +39,7 @@ class _State:
     working = False
     process = 0
     writing = -1  # end of the pipe to the watchdog
+    temporary = ""  # a folder
 
 
 _state = _State()
@@ -138,6 +139,11 @@ def signal_outcome() -> tuple[int, str] | None:
     return code, "interrupted" if code == INTERRUPTED else stopped
 
 
+def remove_at_end(folder: str) -> None:
+    """Has `end_at_once` remove a temporary folder, as nothing that Python runs at its end is run then."""
+    _state.temporary = folder
+
+
 def end_at_once(code: int) -> None:
     """Ends this process when a signal has unwound its command: no thread or library that the signal found at work is waited for.
 
@@ -150,6 +156,10 @@ def end_at_once(code: int) -> None:
             stream.flush()
         except (OSError, ValueError):  # nothing reads it any more
             pass
+    if _state.temporary:
+        import shutil
+
+        shutil.rmtree(_state.temporary, ignore_errors=True)
     acknowledge_signal()
     os._exit(code)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 from multiprocessing import forkserver, resource_tracker
+from multiprocessing.util import get_temp_dir
 
-from dpcli.signal_exit import STOP_NAMES
+from dpcli.signal_exit import STOP_NAMES, remove_at_end
 from dpcli.standard_streams import loud_libraries
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
@@ -30,6 +31,7 @@ def ensure_server(preload: str = "") -> None:
     try:
         resource_tracker.ensure_running()  # the server's start would start it; it lets some signals through
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
+        remove_at_end(get_temp_dir())  # of the server's socket; Python removes it where it ends in its own way
         with loud_libraries():  # each worker decides for itself
             forkserver.set_forkserver_preload([preload] if preload else [])
             forkserver.ensure_running()
