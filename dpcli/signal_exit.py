@@ -24,7 +24,8 @@ _GRACE, _SECOND_GRACE = (
 )  # seconds after which a first, a second signal that Python didn't acknowledge ends the process
 _ACKNOWLEDGED = b"\0"  # no signal's number
 _OVERTAKEN = 0.1  # seconds in which the number of a signal that another thread got may come after the answer to it
-_CODES = {"SIGINT": INTERRUPTED, "SIGTERM": STOPPED, "SIGUSR1": STOPPED, "SIGUSR2": STOPPED}
+STOP_NAMES = ("SIGTERM", "SIGUSR1", "SIGUSR2", "SIGHUP")  # sent by batch systems before they kill; by a closed terminal
+_CODES = {"SIGINT": INTERRUPTED, **dict.fromkeys(STOP_NAMES, STOPPED)}
 
 
 class Ended(KeyboardInterrupt):
@@ -38,6 +39,7 @@ class _State:
     working = False
     process = 0
     writing = -1  # end of the pipe to the watchdog
+    temporary = ""  # a folder
 
 
 _state = _State()
@@ -87,7 +89,7 @@ def _run_watchdog(reading: int, process: int) -> None:
     import select
     import time
 
-    for name in ("SIGHUP", *_CODES):  # they reach the whole group, and are the other one's to answer
+    for name in _CODES:  # they reach the whole group, and are the other one's to answer
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     for number in (0, 1):  # else a reader of our pipes would wait for the watchdog, too
         os.close(number)
@@ -105,6 +107,8 @@ def _run_watchdog(reading: int, process: int) -> None:
         if message == _ACKNOWLEDGED:
             pending, grace, acknowledged_at, ended_well = "", None, time.monotonic(), True
         elif message[0] in numbers and time.monotonic() > acknowledged_at + _OVERTAKEN:
+            if pending and not shows_impatience(message[0]):
+                continue
             grace = _SECOND_GRACE if pending else _GRACE
             pending, ended_well = numbers[message[0]], False
     if not ended_well:
@@ -135,6 +139,11 @@ def signal_outcome() -> tuple[int, str] | None:
     return code, "interrupted" if code == INTERRUPTED else stopped
 
 
+def remove_at_end(folder: str) -> None:
+    """Has `end_at_once` remove a temporary folder, as nothing that Python runs at its end is run then."""
+    _state.temporary = folder
+
+
 def end_at_once(code: int) -> None:
     """Ends this process when a signal has unwound its command: no thread or library that the signal found at work is waited for.
 
@@ -147,8 +156,20 @@ def end_at_once(code: int) -> None:
             stream.flush()
         except (OSError, ValueError):  # nothing reads it any more
             pass
+    if _state.temporary:
+        import shutil
+
+        shutil.rmtree(_state.temporary, ignore_errors=True)
     acknowledge_signal()
     os._exit(code)
+
+
+def shows_impatience(number: int) -> bool:
+    """Returns whether a signal that follows another one asks to end at once.
+
+    SIGHUP doesn't: where a terminal closes, its shell and the system send one each, and a login that ends adds one to SIGTERM.
+    """
+    return signal.Signals(number).name != "SIGHUP"
 
 
 def let_end() -> None:
@@ -166,6 +187,8 @@ def _handle(number: int, frame: FrameType | None) -> None:
         os.kill(os.getpid(), number)
         return
     acknowledge_signal()
+    if _state.name and not shows_impatience(number):
+        return
     first, _state.name = not _state.name, signal.Signals(number).name
     if _state.working and first:
         _unwind(number, frame)

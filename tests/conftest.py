@@ -19,6 +19,8 @@ from tests.support.commands import exit_code
 ROOT = Path(__file__).resolve().parents[1]
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell's background jobs; what tests start would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as under nohup: these tests go on, what they start hears it
+    signal.signal(signal.SIGHUP, lambda number, frame: None)
 if "PYTEST_XDIST_WORKER" in os.environ:  # the workers take the cores: more threads in each would wait for one another
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 

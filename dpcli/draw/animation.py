@@ -68,7 +68,7 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
                 _try_name(path, part)
             {".mp4": _mp4, ".gif": _gif, ".png": _png, "": _folder}[kind](part, pictures, fps)
     except OSError as error:
-        raise DpcError(f"{path}: cannot be written ({error})") from None
+        raise not_writable(path, error) from None
 
 
 def _try_name(path: Path, part: Path) -> None:

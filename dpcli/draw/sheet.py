@@ -92,7 +92,8 @@ def save_picture(image: Any, path: Path) -> None:
         with whole_file(path) as part:
             imageio.imwrite(part, np.asarray(image), extension=path.suffix)
     except (ValueError, OSError) as error:
-        raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
+        why = getattr(error, "strerror", None) or error
+        raise DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder") from None
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -106,7 +107,8 @@ def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
                 _add_families(figure, names)
                 _save(figure, part, dpi)
     except (ValueError, OSError) as error:
-        raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
+        why = getattr(error, "strerror", None) or error
+        raise DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder") from None
     tell_lacking(lacking)
 
 

@@ -21,12 +21,13 @@ from statistics import mean, stdev
 
 from dpcli.evaluate.report.thesis_tables import thesis_tables
 from dpcli.runtime.provenance import file_digest
+from dpcli.runtime.signals import answering
 from dpcli.runtime.whole_file import write_whole
 
 Dpc = Callable[..., str]
 STOPPED = (75, 130, 143)  # exit codes of a command that was asked to stop
 DASH = "–"
-_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP)
 
 
 def dpc(*words: object, threads: int | None = None) -> str:
@@ -43,14 +44,8 @@ def dpc(*words: object, threads: int | None = None) -> str:
         env={**os.environ, **limits},
         start_new_session=main,
     )
-    before = {}
-    if main:  # elsewhere Python allows no handlers
-        before = {one: signal.signal(one, lambda number, _: process.send_signal(number)) for one in _FORWARDED}
-    try:
+    with answering(_FORWARDED, process.send_signal):
         out, _ = process.communicate()
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
     if process.returncode:
         code = process.returncode if process.returncode > 0 else 128 - process.returncode
         print(f"dpc {' '.join(map(str, words))}: exit {code}", file=sys.stderr)

@@ -1,18 +1,16 @@
-"""Stopping politely: SIGTERM, SIGUSR1 and SIGUSR2 set a flag, the running item is finished and saved, exit code 75."""
+"""Stopping politely: SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP set a flag, the running item is finished and saved, exit code 75."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from dpcli.errors import Stopped
-from dpcli.signal_exit import acknowledge_signal
-
-_NAMES = ("SIGTERM", "SIGUSR1", "SIGUSR2")  # batch systems send one of these before they kill
+from dpcli.signal_exit import STOP_NAMES, acknowledge_signal, shows_impatience
 
 
 @dataclass
@@ -29,23 +27,34 @@ class StopRequest:
 
 
 @contextmanager
-def stop_requested() -> Iterator[StopRequest]:
-    """Installs the handlers for the length of a block. The first signal sets the flag, a second one exits at once (75)."""
-    request = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
-        yield request
-        return
+def answering(numbers: Iterable[int], handle: Callable[[int], object]) -> Iterator[None]:
+    """Has `handle` answer signals for the length of a block, in the main thread. Those that are ignored (nohup) stay so."""
 
-    def handle(number: int, frame: object) -> None:
+    def answer(number: int, frame: object) -> None:
         acknowledge_signal()
-        if request.requested:
-            os._exit(Stopped.exit_code)
-        request.requested, request.name = True, signal.Signals(number).name
+        handle(number)
 
-    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    previous = {number: signal.signal(number, handle) for number in numbers}
+    previous = {}
+    if threading.current_thread() is threading.main_thread():  # elsewhere Python allows no handlers
+        heard = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+        previous = {number: signal.signal(number, answer) for number in heard}
     try:
-        yield request
+        yield
     finally:
         for number, old in previous.items():
             signal.signal(number, old)
+
+
+@contextmanager
+def stop_requested() -> Iterator[StopRequest]:
+    """Installs the handlers for the length of a block. The first signal sets the flag, a second one exits at once (75)."""
+    request = StopRequest()
+
+    def handle(number: int) -> None:
+        if not request.requested:
+            request.requested, request.name = True, signal.Signals(number).name
+        elif shows_impatience(number):
+            os._exit(Stopped.exit_code)
+
+    with answering([getattr(signal, name) for name in STOP_NAMES if hasattr(signal, name)], handle):
+        yield request

@@ -116,7 +116,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     if path.is_dir():
         path = Path(os.path.realpath(path))
-    part = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
+    part = path.with_name(_unfinished(path))
     check_regular(path)
     _remove(part)
     _remove_killed(path)
@@ -129,6 +129,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         if full is None:
             raise
         raise full from None
+
+
+def _unfinished(path: Path) -> str:
+    return f".{path.name}.{os.getpid()}.part{path.suffix}"
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -165,7 +169,8 @@ def not_writable(path: Path, error: OSError) -> DataError:
     if error.errno == errno.ENOENT and not path.absolute().parent.is_dir():
         return DataError(f"{path}: the folder {path.parent} does not exist; create it first")
     why = os.strerror(error.errno) if error.errno else str(error).partition("\n")[0]  # HDF5's own words are long
-    return DataError(f"{path}: cannot be written ({why}); name a file in an existing folder")
+    advice = "give it a shorter name" if error.errno == errno.ENAMETOOLONG else "name a file in an existing folder"
+    return DataError(f"{path}: cannot be written ({why}); {advice}")
 
 
 def _remove(part: Path) -> None:
@@ -205,6 +210,19 @@ def check_writable(path: Path, option: str = "-o") -> None:
         read_only = hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY
         why = "the file system is read-only" if read_only else "no permission"
         raise DataError(f"{option} {path}: the folder {folder} can't be written to ({why}); name another place")
+
+
+def check_length(path: Path, option: str = "-o") -> None:
+    """Raises DataError where the file system takes no name as long as that of an output, or of the unfinished file beside it."""
+    folder = next((one for one in path.absolute().parents if one.is_dir()), Path("/"))
+    most = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") else 255
+    unfinished = f".{path.name}.part.new" if path.suffix.lower() == ".h5" else _unfinished(path)
+    longest = len(os.fsencode(unfinished if path.suffix else path.name))
+    if longest > most:
+        length = len(os.fsencode(path.name))
+        raise DataError(
+            f"{option} {path}: the name is too long ({length} bytes); expected {most - longest + length} at most"
+        )
 
 
 def make_folder(folder: Path, option: str = "-o") -> None:

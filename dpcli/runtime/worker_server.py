@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import signal
 from multiprocessing import forkserver, resource_tracker
+from multiprocessing.util import get_temp_dir
 
+from dpcli.signal_exit import STOP_NAMES, remove_at_end
 from dpcli.standard_streams import loud_libraries
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
+STOPPING = [getattr(signal, name) for name in STOP_NAMES if hasattr(signal, name)]
 
 
 def ensure_server(preload: str = "") -> None:
@@ -24,10 +26,12 @@ def ensure_server(preload: str = "") -> None:
     """
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ.update({name: "1" for name in SINGLE_THREAD})  # read by libraries as the server imports them
-    resource_tracker.ensure_running()  # the server's start would start it, and let signals through meanwhile
     # blocked, not ignored: one that comes now is this process's, a moment later
     let_through = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
     try:
+        resource_tracker.ensure_running()  # the server's start would start it; it lets some signals through
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
+        remove_at_end(get_temp_dir())  # of the server's socket; Python removes it where it ends in its own way
         with loud_libraries():  # each worker decides for itself
             forkserver.set_forkserver_preload([preload] if preload else [])
             forkserver.ensure_running()

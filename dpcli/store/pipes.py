@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
 from dpcli.regular_files import why_unreadable
-from dpcli.runtime.whole_file import DiskFull, check_regular, check_writable, disk_full, refuse_pipe
+from dpcli.runtime.whole_file import DiskFull, check_length, check_regular, check_writable, disk_full, refuse_pipe
 
 _PAGES = (".html", ".htm", ".md", ".tex")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
@@ -85,8 +85,9 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
 
     That is an input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data)
     and is no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
-    Raises DataError where the place can't be written to.
+    Raises DataError where the place can't be written to, or the name is too long.
     """
+    check_length(path, option)
     if path.is_dir() or not os.path.lexists(path):
         check_writable(path, option)
         return

@@ -17,11 +17,12 @@ from dpcli.runtime.pool import ordered_map
 from dpcli.store import ScoresWriter
 from tests.support.prepare_helpers import ROOT
 
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGUSR1: 75}
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGUSR1: 75, signal.SIGHUP: 75}
 SAID = {
     signal.SIGINT: "dpc: error: interrupted",
     signal.SIGTERM: "stopped by SIGTERM",
     signal.SIGUSR1: "stopped by SIGUSR1",
+    signal.SIGHUP: "stopped by SIGHUP",
 }
 COMMANDS = {
     "info": ["info", "s.h5"],
@@ -82,7 +83,12 @@ def what_it_said(process: subprocess.Popen) -> str:
 
 @pytest.mark.parametrize(
     ("command", "number"),
-    [(command, number) for command in COMMANDS for number in CODES if command == "profile" or number != signal.SIGUSR1],
+    [
+        (command, number)
+        for command in COMMANDS
+        for number in CODES
+        if command == "profile" or number in (signal.SIGINT, signal.SIGTERM)
+    ],
 )
 def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):
     """From the first line on, while libraries load, at work, at the end."""
@@ -172,7 +178,8 @@ main()
     assert done.returncode == 75 and b"stopped by SIGTERM" in done.stderr
 
 
-def test_what_a_command_keeps_in_tmpdir_goes_with_it(folder):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_a_command_keeps_in_tmpdir_goes_with_it(folder, number):
     (folder / "tmp").mkdir()
     words = ["prepare", "synthetic", "gestures", "--videos-per-class", "400", "-o", "-", "--jobs", "1"]
     for wait in (0.05, 1.5):
@@ -184,7 +191,7 @@ def test_what_a_command_keeps_in_tmpdir_goes_with_it(folder):
             stderr=subprocess.PIPE,
         )
         time.sleep(wait)
-        process.terminate()
+        process.send_signal(number)
         process.communicate(timeout=120)
         assert list((folder / "tmp").iterdir()) == []
 
@@ -195,6 +202,50 @@ def test_a_signal_that_is_ignored_stays_ignored(folder):
     process.send_signal(signal.SIGINT)
     told, _ = process.communicate(timeout=60)
     assert process.returncode == 0 and b"scores" in told
+
+
+def ignoring(number: signal.Signals, words: list[str], cwd: Path) -> subprocess.CompletedProcess:
+    """Runs Python with a signal that is ignored from its start."""
+    code = (
+        f"import os, signal, sys; signal.signal({int(number)}, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    words = [sys.executable, "-c", code, sys.executable, *words]
+    return subprocess.run(words, cwd=cwd, env=env, capture_output=True, timeout=120, start_new_session=True)
+
+
+SIGNAL_TO_ALL = """
+import os, signal, sys
+import dpcli.store.writing.item_pass as item_pass
+from dpcli.__main__ import main
+take = item_pass.ItemPass._take
+def signaled(*given):  # the command, the server of its workers and the workers
+    os.killpg(0, signal.{name})
+    take(*given)
+item_pass.ItemPass._take = signaled
+main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGTERM", "SIGINT"])
+def test_a_signal_that_is_ignored_stays_ignored_at_work_and_in_workers(name, tmp_path):
+    words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o a.h5".split()
+    done = ignoring(getattr(signal, name), ["-c", SIGNAL_TO_ALL.format(name=name), *words], tmp_path)
+    assert done.returncode == 0 and (tmp_path / "a.h5").exists(), done.stderr
+
+
+def test_a_terminal_that_closes_sends_two_signals_which_stop_once(tmp_path):
+    """The shell sends one to its jobs, the system another as the shell ends."""
+    words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o a.h5".split()
+    program = [
+        "-c",
+        SIGNAL_TO_ALL.format(name="SIGHUP").replace("\n    take", "\n    os.killpg(0, 1)\n    take"),
+        *words,
+    ]
+    done = ignoring(signal.SIGUSR2, program, tmp_path)
+    assert done.returncode == 75 and b"stopped by SIGHUP; 1 of 10 samples are kept" in done.stderr, done.stderr
+    again = ignoring(signal.SIGUSR2, ["-m", "dpcli", *words], tmp_path)
+    assert again.returncode == 0 and b"1 of 10" in again.stderr, again.stderr
 
 
 def test_one_signal_ends_a_wait_for_a_pipe(folder):
@@ -243,6 +294,19 @@ def test_a_second_signal_ends_it_at_once(folder):
     assert process.returncode == 75 and told == b"dpc: error: stopped by SIGTERM; run the same command again\n"
 
 
+def test_a_second_hangup_leaves_the_first_its_time_to_tidy_up():
+    code = (
+        "import time, os\nfrom dpcli import signal_exit as s\ns.watch_signals(); s.set_working(True)\n"
+        "try:\n os.write(1, b'x'); time.sleep(60)\n"
+        "except KeyboardInterrupt:\n os.write(1, b'y'); time.sleep(1); os.write(1, b'tidied')"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    for letter in (b"x", b"y"):
+        assert process.stdout.read(1) == letter
+        process.send_signal(signal.SIGHUP)
+    assert process.communicate(timeout=120)[0] == b"tidied"
+
+
 DEAF = """
 import itertools, os, signal, sys
 from dpcli import signal_exit as s
@@ -267,6 +331,7 @@ s.acknowledge_signal()
     [
         ("loops", signal.SIGTERM, -signal.SIGKILL, "stopped by SIGTERM; a library did not come back"),
         ("loops", signal.SIGINT, -signal.SIGKILL, "stopped by SIGINT; a library did not come back"),
+        ("loops", signal.SIGHUP, -signal.SIGKILL, "stopped by SIGHUP; a library did not come back"),
         ("crashes", None, -signal.SIGABRT, "dpc: error: killed, or ended by a crash in a library"),
         ("waits", signal.SIGKILL, -signal.SIGKILL, "dpc: error: killed, or ended by a crash in a library"),
         ("waits", signal.SIGUSR1, 1, "Ended"),  # what a command answers itself

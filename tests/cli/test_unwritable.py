@@ -337,3 +337,38 @@ def test_a_first_run_that_finds_no_room_at_all_does_not_speak_of_an_earlier_one(
     with pytest.raises(DiskFull, match="nothing was left under that name. Free space") as told:
         CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1})
     assert "earlier" not in str(told.value) and not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "end", "most"),
+    [
+        ("prepare merge c.h5 -o", ".h5", 245),
+        ("generate4d fit v.h5 -o", ".h5", 245),
+        ("classify train c.h5 -o", "", 255),
+        ("generate4d render c.h5 -o", ".mp4", 0),
+        ("generate4d view c.h5 -o", ".html", 0),
+        ("info c.h5 --picture", ".png", 0),
+    ],
+)
+def test_a_name_too_long_for_the_unfinished_file_is_refused_before_the_work(words, end, most, folder, capsys):
+    """`.NAME.part.new` lies beside an HDF5 file, `.NAME.PROCESS.part.SUFFIX` beside others."""
+    most = most or 255 - len(f"..{os.getpid()}.part{end}")
+    for count, refused in ((most, False), (most + 1, True), (256, True)):
+        path = folder / ("ä" + "a" * (count - 2 - len(end)) + end)  # a letter of two bytes
+        code = exit_code(*words.replace("c.h5", str(folder / "c.h5")).split(), str(path))
+        said = capsys.readouterr().err
+        assert ("the name is too long" in said) == refused, said
+        if refused:
+            assert code == 3 and f"({count} bytes); expected {most} at most" in said
+        assert not any(one.name.startswith(".") for one in folder.iterdir())
+
+
+def test_a_long_name_is_written_up_to_the_last_letter(tmp_path):
+    path = tmp_path / ("a" * 242 + ".h5")
+    words = "prepare synthetic gestures --videos-per-class 1 --frames 4 --size 32 --jobs 1 -o"
+    assert exit_code(*words.split(), str(path)) == 0 and [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_picture_folder_of_too_long_a_name_is_a_sentence(tmp_path):
+    with pytest.raises(DataError, match=r"cannot be written \(File name too long\); give it a shorter name"):
+        write_pictures(tmp_path / ("a" * 250), [np.zeros((16, 16, 3), np.uint8)], fps=5)

@@ -68,6 +68,8 @@ def main() -> None:
     given = parser.parse_args()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell's background jobs; commands would inherit it
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as under nohup
+        signal.signal(signal.SIGHUP, lambda number, frame: None)
     folder, faults, count = given.folder.resolve(), 0, 0
     if not (folder / "scores.h5").exists():
         make_data(folder)

@@ -20,7 +20,7 @@ from dpcli.runtime.worker_server import ensure_server
 
 if __name__ == "__main__":
     seen = []
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):
         signal.signal(number, lambda number, frame: seen.append(number))
     ensure_server("slow_import")
     while not seen:
@@ -29,7 +29,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP])
 def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Path, number: int) -> None:
     (tmp_path / "slow_import.py").write_text(SLOW)
     (tmp_path / "program.py").write_text(PROGRAM)
@@ -62,3 +62,30 @@ def test_ctrl_c_while_libraries_load_is_a_sentence() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "dpc: error: interrupted\n")
+
+
+STOPPED_AT_WORK = """
+import os, signal, sys
+import dpcli.store.writing.item_pass as item_pass
+from dpcli.__main__ import main
+take = item_pass.ItemPass._take
+def interrupted(*given):
+    os.kill(os.getpid(), signal.SIGINT)
+    take(*given)
+item_pass.ItemPass._take = interrupted
+main()
+"""
+
+
+def test_ctrl_c_leaves_no_folder_of_the_server_in_tmpdir(tmp_path: Path) -> None:
+    root, temporary = Path(__file__).resolve().parents[2], tmp_path / "tmp"
+    temporary.mkdir()
+    words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o a.h5".split()
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED_AT_WORK, *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root), "TMPDIR": str(temporary)},
+        capture_output=True,
+        timeout=120,
+    )
+    assert done.returncode == 130 and list(temporary.iterdir()) == [], done.stderr

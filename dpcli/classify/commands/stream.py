@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -25,7 +24,7 @@ from dpcli.errors import DataError, DpcError, Stopped
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
-from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.runtime.signals import StopRequest, answering, stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import ScoresWriter
 
@@ -133,21 +132,15 @@ def _record(weights: Path, options: StreamOptions, info: ModelInfo, predictor: S
 @contextmanager
 def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
     """Lets the first Ctrl-C end the stream between two frames; raised anywhere, it could be lost in a library's callback."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
-    def handle(number: int, frame: object) -> None:
+    def handle(number: int) -> None:
         """Asks for a stop at the first signal, and interrupts at the second."""
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested, stop.name = True, _CTRL_C
 
-    before = signal.signal(signal.SIGINT, handle)
-    try:
+    with answering([signal.SIGINT], handle):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _follow(

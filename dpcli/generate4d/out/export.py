@@ -10,10 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
-from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, refuse_replacing, whole_file, write_whole
+from dpcli.runtime.whole_file import (
+    check_replaced,
+    not_writable,
+    refuse_broken_link,
+    refuse_replacing,
+    whole_file,
+    write_whole,
+)
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
@@ -76,7 +83,7 @@ def export_sequence(
         write_json(cameras, camera_list(scene, axes))
         write_json(metrics, scene.metrics)
     except OSError as error:
-        raise DpcError(f"{folder}: cannot be written ({error.strerror})") from None
+        raise not_writable(folder, error) from None
     return [folder / name for name in names]
 
 

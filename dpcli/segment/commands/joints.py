@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from pathlib import Path
 
 from dpcli.errors import DataError, UsageError
@@ -44,12 +45,12 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
             for line in taken_for_meters(reader.path, reader.length_unit):
                 log.warn(line)
         counts: Counter[str] = Counter()
-        trees = _trees(reader, chosen, counts, picture)
-        if str(output) == "-":
-            with output_file("-") as target:
-                _write_parts(trees, target, reader, force)
-        else:
-            _WRITERS.get(suffix, _write_folder)(trees, output, reader, force)
+        with closing(_trees(reader, chosen, counts, picture)) as trees:  # its bar ends before an error is told
+            if str(output) == "-":
+                with output_file("-") as target:
+                    _write_parts(trees, target, reader, force)
+            else:
+                _WRITERS.get(suffix, _write_folder)(trees, output, reader, force)
     return counts
 
 
@@ -61,7 +62,7 @@ def _chosen(reader: PartsReader, sequence: str | None) -> list[int]:
     return [reader.names.index(sequence)]
 
 
-Trees = Iterator[tuple[int, CloudSequence, KinematicTree]]
+Trees = Generator[tuple[int, CloudSequence, KinematicTree], None, None]
 
 
 def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:

@@ -8,7 +8,6 @@ whoever works on it is passed over by name.
 from __future__ import annotations
 
 import signal
-import threading
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -21,7 +20,7 @@ from dpcli.runtime.machines.shards import WHOLE, Shard
 from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.pool import LostWorker, on_second, ordered_map
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.runtime.signals import StopRequest, answering, stop_requested
 from dpcli.store.writing.resumable_writer import ResumableWriter
 
 _LISTED = 20  # skipped items named one by one at the end; -v names all as they come
@@ -159,14 +158,8 @@ class ItemPass:
 @contextmanager
 def _interrupted_after() -> Iterator[None]:
     """Delays Ctrl-C until the block has ended, because a half-appended sample would be lost."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     pending: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, frame: pending.append(number))
-    try:
+    with answering([signal.SIGINT], pending.append):
         yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
     if pending:
         raise KeyboardInterrupt

@@ -293,3 +293,14 @@ def test_the_true_values_stand_in_the_file(truth):
     with CloudsReader(truth) as reader:
         joint = reader.read(0).joint
     assert np.ptp(joint[..., VALUE], axis=0).max() > 0.05
+
+
+def test_an_error_is_the_last_line(parts, tmp_path, monkeypatch, capsys):
+    """The bar of what is being found ends first, though its generator would end later."""
+
+    def refused(*given):
+        raise DataError("no room")
+
+    monkeypatch.setattr(command, "write_urdf", refused)
+    assert exit_code("segment", "joints", parts, "-o", tmp_path / "folder") == 3
+    assert capsys.readouterr().err.splitlines()[-1] == "dpc: error: no room"
