@@ -16,7 +16,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.likeness import like, tell_unlike, tell_values
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
-from dpcli.classify.stream.frame_source import CloudFiles, open_frames
+from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
 from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.counted import counted
@@ -93,7 +93,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
         )
         problem = _follow(predictor, frames, new_listener(speaker), stop, watch)
         if not predictor.clips:
-            raise problem or DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
+            raise problem or _nothing_seen(task.source, watch.empty)
         if target is not None:
             target.provenance.append(provenance.record(_record(weights, options, info, predictor), task.seed))
             fused, *single = predictor.mean
@@ -158,7 +158,9 @@ def _follow(
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
             silent = waited if predictor.window.count else 0.0
-            watch.see(predictor.window.count, points, silent)
+            points = watch.see(predictor.window.count, points, silent)
+            if not len(points):  # `dpc prepare` leaves such frames out, so the model learned from videos without them
+                continue
             lines.see(points[:, :3], silent)
             made = predictor.add(points)
             if made is not None:
@@ -194,24 +196,22 @@ def _tell_unlike(task: ModelTask, info: ModelInfo, first: list[np.ndarray]) -> N
 class _IrregularFrames:
     """Warns of the first empty, sparse or late frame at once, and counts them at the end.
 
-    few: whether frames of few points, or none, are what the model takes. window, compare: so many frames are first compared
+    few: whether frames of few points are what the model takes. window, compare: so many frames are first compared
     with what the model learned from.
     """
 
     def __init__(
         self, few: bool = False, window: int = 0, compare: Callable[[list[np.ndarray]], None] = lambda first: None
     ) -> None:
-        self.empty = self.sparse = self.gaps = 0
+        self.empty = self.padded = self.sparse = self.gaps = 0
         self._few, self._window, self._compare = few, window, compare
         self._first: list[np.ndarray] = []
 
-    def see(self, number: int, points: np.ndarray, silent: float) -> None:
-        """Looks at a frame, and at the seconds since the one before."""
-        if number < self._window:
-            self._first.append(points)
-            if number + 1 == self._window:
-                self._compare(self._first)
-                self._first = []
+    def see(self, number: int, points: np.ndarray, silent: float) -> np.ndarray:
+        """Returns a frame without what stands for nothing seen, as `dpc prepare` writes it.
+
+        number: how many frames with points came before it; silent: the seconds since the one before.
+        """
         if silent > _SILENT:
             if not self.gaps:
                 log.warn(
@@ -219,28 +219,51 @@ class _IrregularFrames:
                     " neighbors; reported once"
                 )
             self.gaps += 1
-        if self._few:
-            return
-        if len(points) == 0:
+        seen = without_padding(points)
+        if 0 < len(seen) < len(points):
+            if not self.padded:
+                log.warn(
+                    f"frame {number} has {len(points) - len(seen)} points at the origin, which stand for nothing seen: they are"
+                    " left out, as `dpc prepare` does; reported once"
+                )
+            self.padded += 1
+        if len(seen) == 0:
             if not self.empty:
-                log.warn(f"frame {number} has no points: they are taken to be at the origin; reported once")
+                log.warn(
+                    f"before frame {number} came one without points: such frames are left out and have no number, as in what"
+                    " `dpc prepare` writes; reported once"
+                )
             self.empty += 1
-        elif len(points) < _SPARSE:
+            return seen
+        if number < self._window:
+            self._first.append(seen)
+            if number + 1 == self._window:
+                self._compare(self._first)
+                self._first = []
+        if len(seen) < _SPARSE and not self._few:
             if not self.sparse:
-                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; reported once")
+                log.warn(f"frame {number} has {len(seen)} points, repeated to fill a clip; reported once")
             self.sparse += 1
+        return seen
 
     def sum_up(self) -> None:
         """Logs how many irregular frames there were, where there was more than one."""
         if self._first:  # fewer than a window
             self._compare(self._first)
         counts = {
-            "without points": self.empty,
+            "without points, left out": self.empty,
+            "with points at the origin, left out": self.padded,
             f"of fewer than {_SPARSE} points": self.sparse,
             "after a silence": self.gaps,
         }
         if any(count > 1 for count in counts.values()):
             log.warn("frames in all: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count))
+
+
+def _nothing_seen(source: str, empty: int) -> DataError:
+    if empty:
+        return DataError(f"{source}: none of its frames ({empty}) has a point, so there is nothing to recognize")
+    return DataError(f"{source}: not one frame came; the program before the pipe wrote nothing")
 
 
 def _ending(problem: BaseException | None, stop: StopRequest) -> str:

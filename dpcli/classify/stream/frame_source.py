@@ -19,6 +19,7 @@ from dpcli.store.pipes import standard_input
 _POLL = 0.02  # seconds between looks at a file or folder that may grow
 _SETTLED = 0.1  # seconds a folder's newest file must stay unchanged to count as whole
 _PIECE = 1 << 20
+_ROUNDED = 1e-8  # what remains of 0 where points were turned
 _MOST_POINTS = 10_000_000  # in one frame: a damaged header must not ask for all memory
 _MOST_NUMBERS = 64  # of a point
 _MAGIC, _HDF5 = b"\x93NUMPY", b"\x89HDF"
@@ -173,6 +174,16 @@ def as_frame(points: np.ndarray, where: str) -> np.ndarray:
     if bad:
         raise DataError(f"{where}: {bad} of {counted(len(frame), 'point')} NaN or infinite; drop them before sending")
     return frame
+
+
+def without_padding(points: np.ndarray) -> np.ndarray:
+    """Returns a frame (P,3+F) without its points at the origin where it has several, or nothing else.
+
+    No two measurements are at one place: these fill an array up, or stand for a frame in which nothing was seen, and
+    `dpc prepare` leaves them out as well.
+    """
+    at_origin = (np.abs(points[:, :3]) < _ROUNDED).all(1)
+    return points[~at_origin] if at_origin.sum() > 1 or at_origin.all() else points
 
 
 def _folder_frames(folder: Path, follow: float, files: CloudFiles, columns: tuple[str, ...]) -> Iterator[np.ndarray]:

@@ -58,13 +58,13 @@ def _register_pair(source: list, target: list, before: np.ndarray) -> tuple[np.n
         starts.append(start)
     tree = cKDTree(np.asarray(target[1].points))
     found = [_icp(source[0], target[0], start, 0) for start in starts]
-    some = sorted(found, key=lambda motion: _misfit(source[1], tree, motion)[0])[:2]
+    some = sorted(found, key=lambda motion: _misfit(source[1], target[1], tree, motion)[0])[:2]
     ends = []
     for motion in some:
         for scale in (1, 2):
             motion = _icp(source[scale], target[scale], motion, scale)
-        ends.append((*_misfit(source[1], tree, motion), motion))
-    rest = (*_misfit(source[1], tree, np.eye(4)), np.eye(4))
+        ends.append((*_misfit(source[1], target[1], tree, motion), motion))
+    rest = (*_misfit(source[1], target[1], tree, np.eye(4)), np.eye(4))
     misfit, share, motion = min(ends, key=lambda end: end[0])
     return (motion, share) if misfit < _BETTER * rest[0] else (rest[2], rest[1])
 
@@ -78,8 +78,17 @@ def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:
     return np.round(found, _DIGITS) + 0.0  # no -0
 
 
-def _misfit(source, tree: cKDTree, motion: np.ndarray) -> tuple[float, float]:
-    """Returns the mean distance to the target, cut at twice `_NEAR`, and the share of points nearer than `_NEAR`."""
+def _misfit(source, target, tree: cKDTree, motion: np.ndarray) -> tuple[float, float]:
+    """Returns the mean distance to the target's surface, cut at `_NEAR`, and the share of points nearer than that to a point.
+
+    To the surface, because the beams move with the sensor: their rings on the ground and on walls lie on one another where
+    no motion is assumed.
+    """
     moved = np.asarray(source.points) @ motion[:3, :3].T + motion[:3, 3]
-    distance = tree.query(moved, distance_upper_bound=2 * _NEAR)[0]
-    return float(np.minimum(distance, 2 * _NEAR).mean()), float((distance < _NEAR).mean())
+    distance, partner = tree.query(moved, distance_upper_bound=2 * _NEAR)
+    met = np.isfinite(distance)
+    partner = partner[met]
+    away = np.full(len(moved), _NEAR)
+    across = (moved[met] - np.asarray(target.points)[partner]) * np.asarray(target.normals)[partner]
+    away[met] = np.minimum(np.abs(across.sum(1)), _NEAR)
+    return float(away.mean()), float((distance < _NEAR).mean())

@@ -285,6 +285,20 @@ def test_the_sensors_motion_is_found_from_far_off_starts():
     assert np.linalg.norm(poses[1][:3, 3] - true[:3, 3]) < 0.05 and overlap[0] > 0.5
 
 
+@pytest.mark.parametrize("rows", [16, 32])
+@pytest.mark.parametrize("way", [0.0, 0.05, 0.2, 0.5])
+def test_a_sensor_that_creeps_does_not_stand(way, rows):
+    """The rings of its beams on ground and walls go with it, and lie nearest to one another where it is taken to stand."""
+    lidar, frames = Lidar(tuple(np.linspace(2, -22, rows)), 700, 60.0), []
+    standing = standing_street(np.random.default_rng(3))
+    for at in (0.0, way):
+        seen, _ = scan(standing - [at, -1.75, lidar.height], lidar, 0.02, 0.05, np.random.default_rng(int(100 * at)))
+        frames.append(seen.astype(np.float64))
+    poses, overlap = register_frames(frames, [height_above_ground(frame) < 0.2 for frame in frames])
+    assert np.linalg.norm(poses[1][:3, 3] - [way, 0, 0]) < 0.015 and overlap[0] > 0.5
+    assert way or np.array_equal(poses[1], np.eye(4))
+
+
 def test_beams_end_behind_what_is_free_and_before_what_is_hidden():
     angle = np.linspace(-0.5, 0.5, 400)
     rows = [np.stack([10 * np.cos(angle), 10 * np.sin(angle), np.full(400, z)], 1) for z in np.linspace(-1, 1, 20)]
