@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -43,6 +44,7 @@ _COUNTS = {  # texts of numbers, and how many
     **{(shape, name): (1,) for shape in ("cylinder", "capsule", "sphere") for name in ("radius", "length")},
     ("mesh", "scale"): (1, 3),
 }
+_VERSION = re.compile(rb"\A((?:\xef\xbb\xbf)?<\?xml\s+version\s*=\s*[\"'])[\d.]+")  # simulators write 0.0, and read any
 _XACRO = "it is written in xacro; make a plain URDF of it first: xacro FILE > robot.urdf"
 
 
@@ -116,7 +118,7 @@ def _parse(path: Path, notes: Counter) -> Any:
     utf8_path(path, "yourdfpy")
     try:
         refuse_wrapped(path)
-        text = path.read_bytes().lstrip(b" \t\r\n")
+        text = _VERSION.sub(rb"\g<1>1.0", path.read_bytes().lstrip(b" \t\r\n"))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     try:

@@ -6,6 +6,7 @@ import io
 import zipfile
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.runtime.clips.other_files import PAGE, POINTER, what_it_is
 
@@ -62,7 +63,9 @@ def is_folder(path: Path) -> DataError:
         return DataError(f"{path}: a folder; name one of its {len(models)} files, such as {models[0]}")
     shapes = [file for file in files if file.suffix.lower() in (".ply", *_BY_SUFFIX)]
     if shapes:
-        return DataError(f"{path}: a folder of {len(shapes)} files such as {shapes[0].name}, not a glTF file; {_SHAPE}")
+        _, advice = _BY_SUFFIX.get(shapes[0].suffix.lower(), ("PLY", _SHAPE))
+        many = counted(len(shapes), "file")
+        return DataError(f"{path}: a folder of {many} such as {shapes[0].name}, not a glTF file; {advice}")
     return DataError(f"{path}: a folder; expected a .glb or .gltf file")
 
 

@@ -435,6 +435,8 @@ def test_solids_without_a_size_are_refused(shape, tmp_path):
     "before, robot",
     [
         ('\n\n<?xml version="1.0"?>', "robot"),
+        ('<?xml version="0.0" ?>\n', "robot"),  # as in the data of PyBullet
+        ('\ufeff<?xml version = "1.1" encoding="utf-8"?>', "robot"),
         ('<?xml version="1.0"?><!DOCTYPE robot><!-- made by hand --><?pi x?>', "robot"),
         ("\ufeff", "robot"),
         ("", 'robot xmlns="http://www.ros.org"'),

@@ -792,6 +792,7 @@ def test_files_of_other_formats_are_told_what_to_do(tmp_path, name, data, words)
     [
         (["b.glb", "a.vrm"], "name one of its 2 files, such as a.vrm"),
         (["f_1.obj", "f_2.obj", "f.mtl"], "a folder of 2 files such as f_1.obj, not a glTF file; it holds one shape"),
+        (["walk.fbx"], "a folder of 1 file such as walk.fbx, not a glTF file; open it in Blender"),
         ([], "expected a .glb or .gltf file"),
     ],
 )
