@@ -162,7 +162,7 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
                 refuse_claim(item, path)
                 found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uif" and item.ndim and not _is_bare_dimension(item):
+            elif item.dtype.kind in "uifb" and item.ndim and not _is_bare_dimension(item):
                 try:
                     refuse_claim(item, path)
                     _refuse_filters(item, path)

@@ -97,3 +97,12 @@ def test_tables_of_named_columns_are_told_from_arrays(tmp_path, form):
     for options, said in (([], "holds a table"), (["--frame-column", "frame"], "need it as .csv or .parquet")):
         run = told(*words, *options)
         assert run.returncode == 3 and said in run.stderr and "--frame-column" in run.stderr
+
+
+def test_masks_of_truth_values_leave_points_out(tmp_path):
+    """As h5py writes NumPy's bool."""
+    mask = np.random.default_rng(6).random((6, 40)) < 0.6
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"], file["mask"] = clouds(), mask
+    expected = [cloud[own] for cloud, own in zip(clouds(), mask)]
+    assert all(np.array_equal(a, b) for a, b in zip(frames_of(tmp_path / "a.h5"), expected, strict=True))
