@@ -275,13 +275,12 @@ class ArraySequences(OwnScans):
         source: Source = item.extra["source"]
         try:
             with open_arrays(item.path) as arrays:
-                beside, axes = self._beside(item.path, arrays, source)
-                used = {
-                    *source.keys,
-                    *beside.named(),
-                    *with_track(self.keep, self.track),
-                    *(one.extra["source"].keys[0] for one in self._items if one.path == item.path and not one.problem),
-                }
+                _, axes = self._beside(item.path, arrays, source)
+                sources = [one.extra["source"] for one in self._items if one.path == item.path and not one.problem]
+                keys = dict.fromkeys(key for own in sources for key in own.keys)
+                alike = [key for key in keys if axes and len(axes) == getattr(arrays[key], "ndim", 0)]
+                beside = [name for key in alike for name in find_beside(arrays, key, axes).named()]
+                used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]
                 shape = tuple(first.shape) if axes else ()

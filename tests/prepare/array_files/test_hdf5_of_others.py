@@ -120,3 +120,24 @@ def test_what_is_no_array_of_numbers_is_named(tmp_path, form):
             file["points"], file["stamps"], file["who"] = clouds(), stamps.astype("S"), 7
     reader = ArraySequences(path)
     assert "not read: stamps, who" in reader.summary(reader.items())[0]
+
+
+def test_what_every_sequence_of_a_file_reads_is_not_named(tmp_path):
+    """Groups of one file: each has its own times beside its clouds, or its own numbered frames."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("walk_1", "walk_2"):
+            file[f"{name}/points"], file[f"{name}/time"], file[f"{name}/weight"] = (
+                clouds(),
+                np.arange(6) / 10,
+                np.ones(9),
+            )
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for place in range(4):
+            file[f"walk_{place % 2}/frame_{place}"] = clouds()[place]
+    for name, said in (
+        ("a.h5", "; not read: walk_1/weight, walk_2/weight"),
+        ("b.h5", "walk_0/frame_2 taken as its frames"),
+    ):
+        reader = ArraySequences(tmp_path / name)
+        items = reader.items()
+        assert len(items) == 2 and reader.summary(items)[0].endswith(said)
