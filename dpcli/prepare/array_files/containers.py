@@ -143,6 +143,20 @@ def tables_inside(path: Path) -> list[str]:
     return [name for name in found if not any(name.startswith(f"{other}/") for other in found)]
 
 
+def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
+    """Returns the names of what an HDF5 or NumPy's archive holds beside its ``arrays``: texts, dates, single numbers."""
+    import h5py
+
+    names: list[str] = []
+    if is_hdf5(path):
+        with reading(path), h5py.File(path, "r") as file:
+            names = [name for name, item in _datasets(file, path) if not _is_bare_dimension(item)]
+    elif path.suffix.lower() == ".npz":
+        with reading(path), open_archive(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+    return [name for name in names if name not in arrays]
+
+
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
     import h5py
@@ -162,7 +176,7 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
                 refuse_claim(item, path)
                 found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uif" and item.ndim and not _is_bare_dimension(item):
+            elif item.dtype.kind in "uifb" and item.ndim and not _is_bare_dimension(item):
                 try:
                     refuse_claim(item, path)
                     _refuse_filters(item, path)

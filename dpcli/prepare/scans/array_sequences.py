@@ -18,7 +18,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
 from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, tables_inside
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, others_inside, tables_inside
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
@@ -275,14 +275,13 @@ class ArraySequences(OwnScans):
         source: Source = item.extra["source"]
         try:
             with open_arrays(item.path) as arrays:
-                beside, axes = self._beside(item.path, arrays, source)
-                used = {
-                    *source.keys,
-                    *beside.named(),
-                    *with_track(self.keep, self.track),
-                    *(one.extra["source"].keys[0] for one in self._items if one.path == item.path and not one.problem),
-                }
-                unread = [name for name in arrays if name not in used]
+                _, axes = self._beside(item.path, arrays, source)
+                sources = [one.extra["source"] for one in self._items if one.path == item.path and not one.problem]
+                keys = dict.fromkeys(key for own in sources for key in own.keys)
+                alike = [key for key in keys if axes and len(axes) == getattr(arrays[key], "ndim", 0)]
+                beside = [name for key in alike for name in find_beside(arrays, key, axes).named()]
+                used = {*keys, *beside, *with_track(self.keep, self.track)}
+                unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]
                 shape = tuple(first.shape) if axes else ()
                 shapes = [one.shape for one in first if one.size] if isinstance(first, list) else [first.shape]

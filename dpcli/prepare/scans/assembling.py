@@ -22,6 +22,7 @@ from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
 from dpcli.store.schema import METERS, kept_name, kept_names
 
+_JUDGED = 8  # frames, in which points are looked for that lie at one and the same place
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
 _NEAREST = 300.0  # meters from a sensor that are farther than any measures without measuring something before
@@ -137,7 +138,7 @@ def assemble(
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
-    crowded = is_crowded(clouds[kept[len(kept) // 2]].points)
+    crowded = any(is_crowded(clouds[t].points) for t in kept[:: -(-len(kept) // _JUDGED)])  # the fullest has no padding
     notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
     if not color and (colored := sum(clouds[t].color is not None for t in kept)):
         notes[UNREAD_COLORS] = colored

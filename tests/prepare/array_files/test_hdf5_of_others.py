@@ -97,3 +97,47 @@ def test_tables_of_named_columns_are_told_from_arrays(tmp_path, form):
     for options, said in (([], "holds a table"), (["--frame-column", "frame"], "need it as .csv or .parquet")):
         run = told(*words, *options)
         assert run.returncode == 3 and said in run.stderr and "--frame-column" in run.stderr
+
+
+def test_masks_of_truth_values_leave_points_out(tmp_path):
+    """As h5py writes NumPy's bool."""
+    mask = np.random.default_rng(6).random((6, 40)) < 0.6
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"], file["mask"] = clouds(), mask
+    expected = [cloud[own] for cloud, own in zip(clouds(), mask)]
+    assert all(np.array_equal(a, b) for a, b in zip(frames_of(tmp_path / "a.h5"), expected, strict=True))
+
+
+@pytest.mark.parametrize("form", ["h5", "npz"])
+def test_what_is_no_array_of_numbers_is_named(tmp_path, form):
+    """Times as texts or dates, and single numbers, which nobody reads."""
+    stamps = np.array([f"2024-03-05T10:00:0{t}" for t in range(6)])
+    path = tmp_path / f"a.{form}"
+    if form == "npz":
+        np.savez(path, points=clouds(), stamps=stamps.astype("datetime64[ms]"), who=np.array("anna"))
+    else:
+        with h5py.File(path, "w") as file:
+            file["points"], file["stamps"], file["who"] = clouds(), stamps.astype("S"), 7
+    reader = ArraySequences(path)
+    assert "not read: stamps, who" in reader.summary(reader.items())[0]
+
+
+def test_what_every_sequence_of_a_file_reads_is_not_named(tmp_path):
+    """Groups of one file: each has its own times beside its clouds, or its own numbered frames."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("walk_1", "walk_2"):
+            file[f"{name}/points"], file[f"{name}/time"], file[f"{name}/weight"] = (
+                clouds(),
+                np.arange(6) / 10,
+                np.ones(9),
+            )
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for place in range(4):
+            file[f"walk_{place % 2}/frame_{place}"] = clouds()[place]
+    for name, said in (
+        ("a.h5", "; not read: walk_1/weight, walk_2/weight"),
+        ("b.h5", "walk_0/frame_2 taken as its frames"),
+    ):
+        reader = ArraySequences(tmp_path / name)
+        items = reader.items()
+        assert len(items) == 2 and reader.summary(items)[0].endswith(said)

@@ -63,6 +63,15 @@ def test_many_points_at_one_place_are_told():
         assert (CROWDED in assemble(Item("a", Path("a")), clouds, Lengths()).notes) == told
 
 
+@pytest.mark.parametrize("fullest", range(5))
+def test_padding_is_told_whichever_frame_has_none(fullest):
+    """Points that fill frames up to one size, such as -1: the fullest frame has none of them."""
+    frames = [np.concatenate([POINTS, np.full((12, 3), -1.0)]) for _ in range(5)]
+    frames[fullest] = np.concatenate([POINTS, POINTS[:12] + 0.01])
+    sample = assemble(Item("a", Path("a")), [Cloud(frame) for frame in frames], Lengths(1, "m"))
+    assert sample.notes.get(CROWDED) == 1
+
+
 def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
     corner = np.vstack([np.zeros((1, 3)), POINTS])
     assert clean([Cloud(corner), Cloud(corner)]) == {}
