@@ -45,7 +45,9 @@ def test_what_is_said_lies_under_no_button_and_points_keep_their_place(tmp_path,
     write(tmp_path / "live.html", names=("a_name_of_one_word_that_is_long_" * 4, "bow"))
     script = """<script>setInterval(() => {
       const [said, home, stage] = ["said", "home", "stage"].map((id) => $(id).getBoundingClientRect());
-      root.dataset.apart = said.right <= home.left && $("said").scrollWidth <= said.width + 1 && stage.height > 150;
+      $("play").scrollIntoView();
+      const reached = $("play").getBoundingClientRect().bottom <= innerHeight;
+      root.dataset.apart = reached && said.right <= home.left && $("said").scrollWidth <= said.width + 1 && stage.height > 150;
     }, 200)</script></body>"""
     text = (tmp_path / "live.html").read_text("utf-8")
     (tmp_path / "live.html").write_text(text.replace("</body>", script), "utf-8")

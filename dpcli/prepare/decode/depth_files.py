@@ -43,7 +43,7 @@ WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: of more than 4 GB
-_PHOTOMETRIC = 262  # the tag of TIFF that says so
+_PHOTOMETRIC, _ORIENTATION = 262, 274  # tags of TIFF: which color 0 is; how the picture is turned where it is shown
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
@@ -267,15 +267,20 @@ def read_image(path: Path) -> np.ndarray:
 
 def has_white_at_zero(data: bytes) -> bool:
     """Returns whether the bytes are those of a TIFF that says its 0 is white, which has no defined meaning for depth."""
+    return _tiff_tag(data, _PHOTOMETRIC) == 0
+
+
+def _tiff_tag(data: bytes, tag: int) -> int | None:
+    """Returns a number that a TIFF tells about itself; None where it doesn't, and of other files."""
     if not data.startswith((b"II", b"MM")):
-        return False
+        return None
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(data)) as image:
-            return getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == 0
+            return getattr(image, "tag_v2", {}).get(tag)
     except (OSError, ValueError, SyntaxError, TypeError):  # a kind of TIFF that Pillow doesn't know
-        return False
+        return None
 
 
 def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
@@ -420,8 +425,10 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
             raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
         times = series.times()
         first = series.paths[0]
-        white = first.suffix.lower() in (".tif", ".tiff") and has_white_at_zero(first.read_bytes())
-        told: dict[str, Any] = {"notes": {WHITE_AT_ZERO: 1} if white else {}}
+        tiff = first.read_bytes() if first.suffix.lower() in (".tif", ".tiff") else b""
+        turned = _tiff_tag(tiff, _ORIENTATION) not in (None, 1)  # which OpenCV does
+        known = {WHITE_AT_ZERO: int(has_white_at_zero(tiff)), TURNED: int(turned)}
+        told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
         told = _told_beside(first, archived_depth(first)[1]) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
         video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], **told)
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):

@@ -24,6 +24,7 @@ _IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
 _UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE)
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
+_NO_SCHEMA = "__schemaless__"  # what rosbags calls the type of a channel whose schema the index lacks
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
 
 
@@ -125,7 +126,10 @@ class Recording:
         if fitting:
             return f"choose one that holds {what} with --topic: {first_names(fitting, _LISTED)}"
         held = first_names([f"{name} ({kind})" for name, (kind, _) in self.topics.items()], _LISTED)
-        return f"no topic holds {what}; it has {held or 'no messages'}"
+        told = f"no topic holds {what}; it has {held or 'no messages'}"
+        tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
+        in_doubt = tool and (not held or _NO_SCHEMA in held)
+        return f"{told}; if its index is not whole, {tool} makes it" if in_doubt else told
 
     def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
         """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
@@ -199,7 +203,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         tool = _REPAIR_TOOLS.get(path.suffix.lower())
-        hint = f"; if it was cut off, {tool} repairs it" if tool else ""
+        hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
         raise DataError(
             f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2"
             f" messages{hint}"

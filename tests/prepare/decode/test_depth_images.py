@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.depth_files import WHITE_AT_ZERO, read_array, read_depth_video, read_frame
+from dpcli.prepare.decode.depth_files import TURNED, WHITE_AT_ZERO, read_array, read_depth_video, read_frame
 
 quick = settings(
     max_examples=120, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -122,6 +122,15 @@ def test_texts_of_gray_levels_are_what_they_say(tmp_path, most, kind):
     path.write_text(f"P2\n3 2\n{most}\n0 1 2\n50 99\n")
     with pytest.raises(DataError, match="5 levels of 3x2 pixels, .* truncated or damaged"):
         read_frame(path)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_tiff_that_is_shown_turned_is_told(tmp_path, orientation):
+    frame = np.arange(20, dtype=np.uint16).reshape(4, 5)
+    Image.fromarray(frame).save(tmp_path / "0.tif", tiffinfo={274: orientation})
+    video = read_depth_video(tmp_path)
+    np.testing.assert_array_equal(video.frames[0], frame if orientation == 1 else np.rot90(frame, -1))
+    assert video.notes == ({TURNED: 1} if orientation == 6 else {})
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2", "f4"])

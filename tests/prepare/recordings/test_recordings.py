@@ -495,5 +495,7 @@ def test_damaged_recordings_are_refused_by_name(tmp_path, kind, kept):
     whole = file.read_bytes()
     file.write_bytes(whole[: kept if isinstance(kept, int) else int(kept * len(whole))])
     tool = {"bag": "rosbag reindex", "mcap": "mcap recover"}[kind]
-    with pytest.raises(DataError, match=f"not a readable recording .*if it was cut off, {tool} repairs it"):
+    with pytest.raises(
+        DataError, match=f"not a readable recording .*if it was cut off or lacks its index, {tool} repairs it"
+    ):
         read(RecordedClouds(file))
