@@ -105,6 +105,27 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
                 writer.send(np.ascontiguousarray(picture))
     if not path.exists():
         raise DpcError("the video encoder wrote nothing; a .gif or a folder of pictures needs no encoder")
+    _refuse_incomplete(path)
+
+
+def _refuse_incomplete(path: Path) -> None:
+    """Raises OSError where the last bytes of a video found no room, which an encoder that is asked to end does not tell."""
+    names, place, size = set(), 0, path.stat().st_size
+    with open(path, "rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            head = file.read(16)
+            length = int.from_bytes(head[:4], "big")
+            length = int.from_bytes(head[8:], "big") if length == 1 else length
+            names.add(head[4:8])
+            if length < 8:
+                break
+            place += length
+    if place == size and {b"moov", b"mdat"} <= names:
+        return
+    with _telling(path), open(path, "ab") as file:
+        file.write(bytes(_ROOM))  # the system says why
+    raise OSError("the video encoder ended early: the file is incomplete")
 
 
 @contextmanager
@@ -129,6 +150,7 @@ def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> No
         writer.write(picture[..., ::-1])
     if writer is not None:
         writer.release()
+        _refuse_incomplete(path)
 
 
 def _even(picture: np.ndarray) -> np.ndarray:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -150,3 +153,34 @@ def test_a_browser_shows_the_colors_that_were_written(tmp_path, side):
     assert seen, said[-2000:]
     read = np.array([[int(level) for level in color.split(",")] for color in seen[1].split()])
     assert np.abs(read - colors).max() <= 8
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from dpcli.draw.animation import write_pictures
+from dpcli.errors import DpcError
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
+try:
+    write_pictures(Path("a.mp4"), [np.full((16, 16, 3), n, np.uint8) for n in range(90)], fps=10)
+except DpcError as error:
+    print(error)
+"""
+
+
+def test_a_video_whose_last_bytes_find_no_room_is_an_error_wherever_it_is_cut(tmp_path):
+    """An encoder writes a short one as it ends, and doesn't tell that it could not."""
+
+    def write(limit):
+        words = [sys.executable, "-c", FULL, str(limit)]
+        env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+        return subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, check=True).stdout
+
+    assert write(1 << 20) == ""
+    whole = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "a.mp4").unlink()
+    for limit in (1000, len(whole) - 1):
+        assert "a.mp4: the file size limit is reached" in write(limit)
+        assert list(tmp_path.iterdir()) == []
+    assert write(len(whole)) == "" and (tmp_path / "a.mp4").read_bytes() == whole
