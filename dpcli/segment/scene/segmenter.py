@@ -100,8 +100,9 @@ class SceneSegmenter(Segmenter):
             )
         if not found.sensor_known:
             log.warn(
-                f"{name}: the ranges don't fit a sensor at the origin, before or after shift, so what it saw through is"
-                " unknown; expect false alarms, or give each frame in the sensor's own coordinates"
+                f"{name}: the ranges don't fit a sensor at the origin, before or after shift, in all frames (are they in"
+                " one map's coordinates?), so what it saw through is unknown, or wrong; expect false alarms and misses, or give"
+                " each frame in the sensor's own coordinates"
             )
         if not found.ground_seen:
             log.warn(
