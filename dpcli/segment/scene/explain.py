@@ -54,14 +54,19 @@ class SceneExplanation:
 def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings) -> SceneExplanation:
     """Returns what stands and what moves in frames f64 (N_t,3), meters, in the order of time.
 
-    sensor: places f64 (3) in the frames' coordinates where the sensor may have been; the first one that fits is taken.
+    sensor: places f64 (3) in the frames' coordinates where the sensor may have been; the first one that fits the largest
+    frame is taken.
     """
     filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
     poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
-    dropped, ground_seen = 0, True
+    dropped, ground_seen, sensor_known = 0, True, True
     if len(filled) > 1:
-        world, own, turn, apart, ground_seen = _build_world([frames[t] for t in filled], sensor, settings)
+        shown = [frames[t] for t in filled]
+        largest = max(shown, key=len)
+        eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
+        sensor_known = eye is not None and all(_may_be_sensor(shown[t], eye) for t in (0, -1))
+        world, own, turn, apart, ground_seen = _build_world(shown, eye, settings)
         every = find_moving_objects(world, settings)
         found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
         for number, one in enumerate(found, 1):
@@ -71,8 +76,8 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
         poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
         objects = [_in_input_axes(one, filled, turn) for one in found]
     confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
-    known = len(filled) < 2 or world.frames[0].origin is not None
-    return SceneExplanation(labels, poses, objects, confidence, [filled[t] for t in apart], dropped, ground_seen, known)
+    far = [filled[t] for t in apart]
+    return SceneExplanation(labels, poses, objects, confidence, far, dropped, ground_seen, sensor_known)
 
 
 def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:
@@ -81,15 +86,13 @@ def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> di
 
 
 def _build_world(
-    frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings
+    frames: list[np.ndarray], eye: np.ndarray | None, settings: SceneSettings
 ) -> tuple[World, np.ndarray, np.ndarray, list[int], bool]:
-    """Returns the registered frames, their poses f64 (T,4,4) in upright axes, the turn (4,4) to these, frames apart, and
-    whether a ground was seen.
+    """Returns the registered frames, seen from the place `eye` (3) if it is known, their poses f64 (T,4,4) in upright axes,
+    the turn (4,4) to these, frames apart, and whether a ground was seen.
     """
-    largest = max(frames, key=len)
-    eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
     turn = np.eye(4)
-    up, ground_seen = find_up(largest, eye)
+    up, ground_seen = find_up(max(frames, key=len), eye)
     turn[:3, :3] = level(up)
     upright = [frame @ turn[:3, :3].T for frame in frames]
     heights = [height_above_ground(frame) for frame in upright]

@@ -21,6 +21,9 @@ from dpcli.store.parts import PartsSample
 from dpcli.store.schema import METERS
 
 _FARTHEST = 1e7  # meters, between points of a scene
+_ROOM = 5.0  # meters from the middle, within which half of the points of a room lie: nobody drives there
+_DRIVES = 20.0  # meters per second that something in a street may well have
+_SLOW = 2.0  # seconds between frames beyond which nothing that drives is met twice
 _USUAL = (0.3, 2000.0)  # meters from the middle, within which half of the points of a room or a street lie
 
 
@@ -63,7 +66,9 @@ class SceneSegmenter(Segmenter):
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
         seen, place = _without_repeats(clouds, order)
         found = explain_scene([clouds[t] for t in seen], list(moved(origins, to_meters)), self.settings)
-        _tell_size(sequence.name, clouds, length_unit)
+        radius = _tell_size(sequence.name, clouds, length_unit)
+        if sequence.time is not None and radius > _ROOM:
+            self._tell_pace(sequence.name, np.diff(sequence.time[seen]))
         self._tell(sequence.name, [seen[t] for t in found.apart], found, count - len(seen))
         label = np.concatenate([found.labels[place[t]] for t in range(count)])
         motions, flows = np.tile(np.eye(4), (len(pairs), self.slots, 1, 1)), []
@@ -95,8 +100,9 @@ class SceneSegmenter(Segmenter):
             )
         if not found.sensor_known:
             log.warn(
-                f"{name}: the ranges don't fit a sensor at the origin, before or after shift, so what it saw through is"
-                " unknown; expect false alarms, or give each frame in the sensor's own coordinates"
+                f"{name}: the ranges don't fit a sensor at the origin, before or after shift, in all frames (are they in"
+                " one map's coordinates?), so what it saw through is unknown, or wrong; expect false alarms and misses, or give"
+                " each frame in the sensor's own coordinates"
             )
         if not found.ground_seen:
             log.warn(
@@ -105,6 +111,18 @@ class SceneSegmenter(Segmenter):
             )
         if repeats:
             log.warn(f"{name}: {counted(repeats, 'frame')} looked at once with the one before: the points are the same")
+
+    def _tell_pace(self, name: str, steps: np.ndarray) -> None:
+        """Warns where frames are so many seconds (T-1) apart that usual speeds take things farther than they are sought."""
+        step = float(np.median(steps)) if len(steps) else 0.0
+        if step * _DRIVES > self.settings.travel + 1e-6:
+            advice = (
+                f"--set travel={np.ceil(_DRIVES * step):g} looks farther" if step <= _SLOW else "is time in seconds?"
+            )
+            log.warn(
+                f"{name}: frames are {step:.3g} s apart, and things are sought up to {self.settings.travel:g} m a frame: what"
+                f" moves faster than {self.settings.travel / step:.3g} m/s is missed, or gets a lower speed; {advice}"
+            )
 
 
 def _without_repeats(clouds: list[np.ndarray], order: np.ndarray) -> tuple[list[int], np.ndarray]:
@@ -118,8 +136,11 @@ def _without_repeats(clouds: list[np.ndarray], order: np.ndarray) -> tuple[list[
     return seen, place
 
 
-def _tell_size(name: str, clouds: list[np.ndarray], length_unit: str) -> None:
-    """Warns where clouds f64 (N_t,3), in meters, are too small or large for a scene, as they are in a wrong unit."""
+def _tell_size(name: str, clouds: list[np.ndarray], length_unit: str) -> float:
+    """Returns from how far around its middle half of a cloud's points lie, meters; clouds f64 (N_t,3).
+
+    Warns where they are too small or large for a scene, as they are in a wrong unit.
+    """
     radii = [float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1))) for own in clouds if len(own)]
     radius = float(np.median(radii)) if radii else 0.0
     if 0 < radius and not _USUAL[0] <= radius <= _USUAL[1]:
@@ -127,6 +148,7 @@ def _tell_size(name: str, clouds: list[np.ndarray], length_unit: str) -> None:
             f"{name}: half of a frame's points lie within {radius:.2g} m, expected a street or a room; if that is wrong,"
             f" convert the data again with the right --unit (the file's is {length_unit or 'unknown'})"
         )
+    return radius
 
 
 def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) -> np.ndarray:

@@ -212,6 +212,24 @@ def test_what_had_to_be_guessed_is_told(change, unit, warned, capsys):
     assert not capsys.readouterr().err  # nothing had to be guessed in the street itself
 
 
+def test_one_frame_of_a_map_that_fits_the_sensor_does_not_speak_for_all(capsys):
+    first, second, last = frames_of(street())
+    explained(changed([first[::9] + [7, 30, 0], second[::9], np.concatenate([last, last])]), [(0, 1)])
+    assert "in all frames (are they in one map's coordinates?)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("step", "travel", "warned"),
+    [(0.2, 4, ""), (0.5, 4, "faster than 8 m/s is missed, or gets a lower speed; --set travel=10 looks"), (0.5, 10, "")]
+    + [(100, 4, "is time in seconds?")],
+)
+def test_frames_too_far_apart_in_time_for_the_search_are_told(step, travel, warned, capsys):
+    thin = [frame[::9] for frame in frames_of(street())]
+    explained(changed([*thin, thin[-1]], time=step * np.arange(4)), travel=travel)
+    said = capsys.readouterr().err
+    assert warned in said and ("things are sought" in said) == bool(warned)
+
+
 def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
     labels, said = explained(street(), most_objects=1)
     assert "street: 1 moving objects besides the largest 1" in capsys.readouterr().err
