@@ -120,8 +120,6 @@ def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
                 groups.setdefault(name.rpartition("/")[0], []).append(name)
     found = []
     for group, names in groups.items():
-        if len({arrays[name].dtype.kind == "f" for name in names if len(arrays[name])}) > 1:
-            continue  # such as the vertices and triangles of a mesh, saved without names
         last = [name.rpartition("/")[2] + "." for name in names]  # no suffix: a point may stand in a number
         named = list(zip(parse_names(last), names))
         shapes = {own.shape for own, name in named if 0 not in arrays[name].shape}
