@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.util import get_temp_dir
 
@@ -12,6 +13,8 @@ from dpcli.standard_streams import loud_libraries
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+_LONGEST = 70  # bytes of TMPDIR: a socket's path has 107 at most, and the folder in it and the socket take 33 of them
 
 STOPPING = [getattr(signal, name) for name in STOP_NAMES if hasattr(signal, name)]
 
@@ -31,7 +34,7 @@ def ensure_server(preload: str = "") -> None:
     try:
         resource_tracker.ensure_running()  # the server's start would start it; it lets some signals through
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
-        remove_at_end(get_temp_dir())  # of the server's socket; Python removes it where it ends in its own way
+        remove_at_end(choose_socket_folder())  # Python removes it only where it ends in its own way
         with loud_libraries():  # each worker decides for itself
             forkserver.set_forkserver_preload([preload] if preload else [])
             forkserver.ensure_running()
@@ -42,3 +45,13 @@ def ensure_server(preload: str = "") -> None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def choose_socket_folder() -> str:
+    """Returns the folder of the sockets of this process and of its workers: in TMPDIR or, where that path is too long, in /tmp."""
+    place = tempfile.gettempdir()
+    try:
+        tempfile.tempdir = place if len(os.fsencode(place)) <= _LONGEST else "/tmp"
+        return get_temp_dir()
+    finally:
+        tempfile.tempdir = place

@@ -110,8 +110,8 @@ _CLOUDS = (
         "shift",
         "f64",
         ("S", 3),
-        "what was subtracted from the coordinates of a sequence because float32 can't hold them (maps): points plus shift"
-        " are the original coordinates, divided by any `--scale`. Absent where nothing was subtracted",
+        "what was subtracted from the coordinates of a sequence because float32 can't hold them (maps, small objects"
+        " far away): points plus shift are the original coordinates, divided by any `--scale`. Absent where nothing was subtracted",
         optional=True,
     ),
     Field(f"{KEPT}NAME", "f32", ("P",), "a column of the raw data, kept on request (`--keep-fields NAME`)", True),

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -77,15 +78,40 @@ main()
 """
 
 
-def test_ctrl_c_leaves_no_folder_of_the_server_in_tmpdir(tmp_path: Path) -> None:
-    root, temporary = Path(__file__).resolve().parents[2], tmp_path / "tmp"
-    temporary.mkdir()
-    words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o a.h5".split()
-    done = subprocess.run(
-        [sys.executable, "-c", STOPPED_AT_WORK, *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root), "TMPDIR": str(temporary)},
+MADE = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o a.h5".split()
+
+
+def run_with_workers(
+    start: list[str], folder: Path, temporary: Path, words: list[str] = MADE
+) -> subprocess.CompletedProcess:
+    temporary.mkdir(exist_ok=True)
+    return subprocess.run(
+        [sys.executable, *start, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2]), "TMPDIR": str(temporary)},
         capture_output=True,
         timeout=120,
     )
-    assert done.returncode == 130 and list(temporary.iterdir()) == [], done.stderr
+
+
+def test_ctrl_c_leaves_no_folder_of_the_server_in_tmpdir(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(dir="/tmp") as short:  # longer ones have none
+        done = run_with_workers(["-c", STOPPED_AT_WORK], tmp_path, temporary := Path(short, "tmp"))
+        assert done.returncode == 130 and list(temporary.iterdir()) == [], done.stderr
+
+
+@pytest.mark.parametrize("letters", [70, 71, 120])
+def test_workers_start_where_the_path_of_tmpdir_is_too_long_for_a_socket(tmp_path: Path, letters: int) -> None:
+    with tempfile.TemporaryDirectory(dir="/tmp") as short:
+        temporary = Path(short, "x" * (letters - 1 - len(short)))
+        done = run_with_workers(["-m", "dpcli"], tmp_path, temporary)
+        assert done.returncode == 0 and list(temporary.iterdir()) == [], done.stderr
+
+
+def test_training_loads_clips_in_workers_where_the_path_of_tmpdir_is_too_long_for_a_socket(tmp_path: Path) -> None:
+    words = "classify train a.h5 -o run --preset tiny --epochs 1 --set epochs_dynamic=0 --set workers=1".split()
+    with tempfile.TemporaryDirectory(dir="/tmp") as short:
+        temporary = Path(short, "x" * 100)
+        for one in (MADE, words):
+            done = run_with_workers(["-m", "dpcli"], tmp_path, temporary, one)
+            assert done.returncode == 0, done.stderr

@@ -11,6 +11,7 @@ from dpcli.classify.data.clips import Clip, ClipSource
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
+from dpcli.runtime.worker_server import choose_socket_folder
 
 # Points (b,T,P,3), labels (b), -1 for none, and numbers of the clips (b).
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -63,6 +64,8 @@ class EpochBatches:
         dataset = _ClipDataset(self.source, clips, number, turn * len(clips))
         workers = self.schedule.workers
         options = {"num_workers": workers, "multiprocessing_context": "forkserver"} if workers else {}
+        if workers:
+            choose_socket_folder()
         yield from torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, mine), self.share, **options)
 
     def _draw(self, number: int) -> list[Clip]:
