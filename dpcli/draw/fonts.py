@@ -12,24 +12,10 @@ from dpcli.counted import counted
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
-_SLANTED = (
-    "bold",
-    "black",
-    "heavy",
-    "thin",
-    "light",
-    "italic",
-    "oblique",
-    "condensed",
-    "mono",
-    "serif",
-)  # are asked last
-_WITHOUT_LETTERS = (
-    "lastresort",
-    "blank",
-    "emoji",
-    "symbol",
-)  # that draw boxes, nothing, or no letters for what they claim
+# Words in the names of fonts that are asked last.
+_SLANTED = "bold black heavy thin light italic oblique condensed mono serif".split()
+# Fonts that draw boxes, nothing, or no letters for what they claim.
+_WITHOUT_LETTERS = ("lastresort", "blank", "emoji", "symbol")
 
 
 def text_font(size: int, text: str = "") -> Any:

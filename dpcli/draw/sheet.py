@@ -92,8 +92,12 @@ def save_picture(image: Any, path: Path) -> None:
         with whole_file(path) as part:
             imageio.imwrite(part, np.asarray(image), extension=path.suffix)
     except (ValueError, OSError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder") from None
+        raise _not_written(path, error) from None
+
+
+def _not_written(path: Path, error: Exception) -> DataError:
+    why = getattr(error, "strerror", None) or error
+    return DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder")
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -107,8 +111,7 @@ def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
                 _add_families(figure, names)
                 _save(figure, part, dpi)
     except (ValueError, OSError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder") from None
+        raise _not_written(path, error) from None
     tell_lacking(lacking)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.export import (
+    POINT_OPACITY,
     as_sequence,
     export_file,
     export_sequence,
@@ -28,7 +29,6 @@ from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
 
 _SPLATS = ("ply", "splat", "compressed.ply", "spz")  # one file for a file's name, one a frame for a folder's
 _TABLES = ("cameras", "metrics")  # one .json each
-_CLOUD_OPACITY = 0.3  # least opacity of a point of a cloud, where nothing else is asked for
 
 
 def export_scene(
@@ -60,7 +60,7 @@ def export_scene(
     if time is not None:
         scene.require_times(np.array([time]), scene_file, f"--time is {time:g}")
     if form == "clouds":
-        name, least = str(root["source"]) or "scene", _CLOUD_OPACITY if min_opacity is None else min_opacity
+        name, least = str(root["source"]) or "scene", POINT_OPACITY if min_opacity is None else min_opacity
         sequence = as_sequence(scene, name, min_opacity=least, points=points, rng=generator(seed), axes=axes)
         _export_clouds(sequence, output, root, [*history, entry], seed, force)
     else:

@@ -17,6 +17,7 @@ from dpcli.generate4d.config import CATALOG, FitConfig, Supervision
 from dpcli.generate4d.fit import COLUMNS, FitRun
 from dpcli.generate4d.fitted_psnr import fitted_psnr
 from dpcli.generate4d.optimizer import SceneOptimizer
+from dpcli.generate4d.out.export import POINT_OPACITY
 from dpcli.generate4d.out.fit_curves import draw_curves
 from dpcli.generate4d.out.preview import write_preview
 from dpcli.generate4d.out.scene_writer import to_scene
@@ -38,8 +39,6 @@ from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write_scene
 from dpcli.store.views import ViewsReader
 from dpcli.store.writing.already_made import already_made
-
-_SEEN = 0.3  # opacity of a Gaussian that `export --as clouds` takes for a point of the object
 
 
 def fit_scene(
@@ -91,10 +90,10 @@ def fit_scene(
 
 def _tell_faint(scene: GaussianScene) -> None:
     """Warns where a fit let the object fade away: of a small or thin one, an empty picture has a high PSNR, too."""
-    if (most := float(scene.opacity.max())) < _SEEN:
+    if (most := float(scene.opacity.max())) < POINT_OPACITY:
         log.warn(
-            f"no Gaussian is {_SEEN} opaque or more, the most opaque has {most:.2g}: hardly anything of the object is seen, whatever "
-            "the PSNR; fit larger pictures (--size) or for more steps, of a clip in which the object is larger"
+            f"no Gaussian is {POINT_OPACITY} opaque or more, the most opaque has {most:.2g}: hardly anything of the object is seen, "
+            "whatever the PSNR; fit larger pictures (--size) or for more steps, of a clip in which the object is larger"
         )
 
 

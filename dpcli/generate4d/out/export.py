@@ -24,6 +24,7 @@ from dpcli.runtime.whole_file import (
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
+POINT_OPACITY = 0.3  # least opacity of a Gaussian that is a point of the object
 _SINGLE = {"ply": write_splat_ply, "splat": write_splat, "compressed.ply": write_compressed_ply, "spz": write_spz}
 
 
@@ -113,7 +114,7 @@ def as_sequence(
     scene: GaussianScene,
     name: str,
     *,
-    min_opacity: float = 0.3,
+    min_opacity: float = POINT_OPACITY,
     points: int | None = None,
     rng: np.random.Generator | None = None,
     axes: str = "player",

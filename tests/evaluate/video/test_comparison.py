@@ -252,7 +252,10 @@ def test_what_a_video_is_said_to_be_compared_as_is_said_of_two_and_of_many(tmp_p
     assert any("filmed at other moments" in note for note in single["notes"])
     (tmp_path / "c.json").write_text(json.dumps(single))
     shared = ["--truth", str(lone), "--metrics", "psnr", "--json"]
-    invoke = lambda *words: json.loads(CliRunner().invoke(evaluate.ROOM.application(), words).stdout)  # noqa: E731
+
+    def invoke(*words: str) -> dict:
+        return json.loads(CliRunner().invoke(evaluate.ROOM.application(), words).stdout)
+
     notes = invoke("compare", str(first), str(second), *shared)["notes"]
     assert [note for note in notes if note.startswith("A: ")] == [f"A: {note}" for note in single["notes"]]
     assert any(note.startswith("B: ") and "no alpha" in note for note in notes)
