@@ -15,7 +15,9 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.recordings.foxglove import FOXGLOVE_KINDS, as_ros
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
+from dpcli.prepare.recordings.mcap import McapReader
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -24,7 +26,6 @@ _IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
 _UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE)
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
-_NO_SCHEMA = "__schemaless__"  # what rosbags calls the type of a channel whose schema the index lacks
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
 
 
@@ -128,8 +129,7 @@ class Recording:
         held = first_names([f"{name} ({kind})" for name, (kind, _) in self.topics.items()], _LISTED)
         told = f"no topic holds {what}; it has {held or 'no messages'}"
         tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
-        in_doubt = tool and (not held or _NO_SCHEMA in held)
-        return f"{told}; if its index is not whole, {tool} makes it" if in_doubt else told
+        return f"{told}; if its index is not whole, {tool} makes it" if tool and not held else told
 
     def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
         """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
@@ -143,15 +143,20 @@ class Recording:
                 if found is None:
                     return
                 connection, logged, raw = found
-                content = self._content(raw, connection.msgtype) if self.read % stride == 0 else None
+                content = self._content(raw, connection) if self.read % stride == 0 else None
             self.read += 1
             if content is not None:
                 yield Message(content, connection.msgtype, logged)
 
-    def _content(self, raw: bytes, kind: str) -> Any:
-        if kind in LIVOX_KINDS:
-            return read_livox(raw, ros1=not self._reader.is2)
-        return self._reader.deserialize(raw, kind)
+    def _content(self, raw: bytes, connection: Any) -> Any:
+        kind = connection.msgtype
+        if isinstance(self._reader, McapReader):
+            content = self._reader.decode(connection, raw)
+        elif kind in LIVOX_KINDS:
+            content = read_livox(raw, ros1=not self._reader.is2)
+        else:
+            content = self._reader.deserialize(raw, kind)
+        return as_ros(content, kind) if kind in FOXGLOVE_KINDS else content
 
 
 def _unlisted(folder: Path) -> list[str]:
@@ -175,8 +180,11 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
-            reader.open()
+            if called.suffix == ".mcap" and not called.is_dir():
+                reader: Any = McapReader(called)
+            else:
+                reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
+                reader.open()
         try:
             yield Recording(path, reader)
         finally:
@@ -205,6 +213,5 @@ def _damage_named(path: Path) -> Iterator[None]:
         tool = _REPAIR_TOOLS.get(path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
         raise DataError(
-            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2"
-            f" messages{hint}"
+            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file{hint}"
         ) from None
