@@ -11,7 +11,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -44,10 +44,52 @@ class Channel:
 
 
 class McapReader:
-    """Reads an open MCAP file. topics: by name, with ``msgtype`` and ``msgcount``; connections: its channels.
+    """Reads the MCAP files of one recording. topics: by name, with ``msgtype`` and ``msgcount``; connections: their channels.
 
     Whatever a damaged file makes struct, zlib and the decompression raise comes through; what is said here is a ValueError.
     """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._files: list[_McapFile] = []
+        self._stores: dict[Channel, Any] = {}
+        try:
+            for path in paths:
+                self._files.append(_McapFile(path))
+        except BaseException:
+            self.close()
+            raise
+        self.connections = list(dict.fromkeys(one for file in self._files for one in file.connections))
+        self.topics: dict[str, SimpleNamespace] = {}
+        for file in self._files:
+            for one, count in file.connections.items():
+                topic = self.topics.setdefault(one.topic, SimpleNamespace(msgtype=one.msgtype, msgcount=0))
+                topic.msgtype = one.msgtype if topic.msgtype == one.msgtype else None
+                topic.msgcount += count
+
+    def close(self) -> None:
+        """Closes the files."""
+        for file in self._files:
+            file.close()
+
+    def messages(self, connections: Collection[Channel]) -> Iterator[tuple[Channel, int, bytes]]:
+        """Yields the messages of channels, sorted by when they were recorded: the channel, that in nanoseconds, the bytes."""
+        return heapq.merge(*(file.messages(connections) for file in self._files), key=lambda message: message[1])
+
+    def decode(self, channel: Channel, raw: bytes) -> Any:
+        """Returns the content of a message, with its fields as attributes. Raises ValueError where it is damaged."""
+        if channel.encoding in ("protobuf", "json"):
+            return (read_protobuf if channel.encoding == "protobuf" else read_json)(raw, channel.msgtype)
+        ros1 = channel.encoding == "ros1"
+        if channel.msgtype in LIVOX_KINDS:
+            return read_livox(raw, ros1=ros1)
+        if channel not in self._stores:
+            self._stores[channel] = _typestore(channel)
+        store = self._stores[channel]
+        return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, channel.msgtype)
+
+
+class _McapFile:
+    """Reads one open file. connections: its channels and how many messages they have."""
 
     def __init__(self, path: Path) -> None:
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
@@ -55,7 +97,6 @@ class McapReader:
         self._pieces: list[tuple[int, int, int, int]] = []  # (first time, place, kind, size) of chunks and messages
         self._channels_in: dict[int, set[int]] = {}  # by the places of chunks, where an index tells
         self._counts: Counter[int] = Counter()
-        self._stores: dict[int, Any] = {}
         self._file = path.open("rb")
         self._size = self._file.seek(0, os.SEEK_END)
         try:
@@ -63,20 +104,13 @@ class McapReader:
         except BaseException:
             self.close()
             raise
-        self.connections = [self._described(number) for number in self._channels]
-        self.topics: dict[str, SimpleNamespace] = {}
-        for one in self.connections:
-            topic = self.topics.setdefault(one.topic, SimpleNamespace(msgtype=one.msgtype, msgcount=0))
-            topic.msgtype = one.msgtype if topic.msgtype == one.msgtype else None
-            topic.msgcount += self._counts[one.id]
+        self.connections = {self._described(number): self._counts[number] for number in self._channels}
 
     def close(self) -> None:
-        """Closes the file."""
         self._file.close()
 
     def messages(self, connections: Collection[Channel]) -> Iterator[tuple[Channel, int, bytes]]:
-        """Yields the messages of channels, sorted by when they were recorded: the channel, that in nanoseconds, the bytes."""
-        wanted = {one.id: one for one in connections}
+        wanted = {one.id: one for one in connections if one in self.connections}
         waiting: list[tuple[int, int, int, int, bytes]] = []
         for start, at, kind, size in [*sorted(self._pieces), (2**64, 0, 0, 0)]:
             while waiting and waiting[0][0] < start:
@@ -87,18 +121,6 @@ class McapReader:
             for place, (number, logged, raw) in enumerate(self._messages_of(at, kind, size)):
                 if number in wanted:
                     heapq.heappush(waiting, (logged, at, place, number, bytes(raw)))
-
-    def decode(self, channel: Channel, raw: bytes) -> Any:
-        """Returns the content of a message, with its fields as attributes. Raises ValueError where it is damaged."""
-        if channel.encoding in ("protobuf", "json"):
-            return (read_protobuf if channel.encoding == "protobuf" else read_json)(raw, channel.msgtype)
-        ros1 = channel.encoding == "ros1"
-        if channel.msgtype in LIVOX_KINDS:
-            return read_livox(raw, ros1=ros1)
-        if channel.id not in self._stores:
-            self._stores[channel.id] = _typestore(channel)
-        store = self._stores[channel.id]
-        return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, channel.msgtype)
 
     def _survey(self) -> None:
         if self._read(0, len(_MAGIC)) != _MAGIC:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,10 +97,10 @@ class Recording:
     the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
     """
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    def __init__(self, path: Path, reader: Any, topics: Mapping[str, Any]) -> None:
         self.path, self._reader, self.read = path, reader, 0
         self.topics: dict[str, tuple[str, int]] = {
-            name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()
+            name: (info.msgtype or "several types", info.msgcount) for name, info in topics.items()
         }  # name -> (type, number of messages)
         self.unlisted = _unlisted(path) if path.is_dir() else []
 
@@ -165,6 +165,21 @@ def _unlisted(folder: Path) -> list[str]:
     return [name for name in names if not re.search(rf"(?<![\w.-]){re.escape(name.removesuffix('.zstd'))}", text)]
 
 
+def _packs_messages(folder: Path) -> bool:
+    """Returns whether a folder is a ROS 2 bag in which every message is packed by itself, as only its metadata.yaml says."""
+    text = (folder / _METADATA).read_text("utf-8", "replace") if is_recording(folder) else ""
+    return re.search(r"compression_mode:\W*message", text, re.IGNORECASE) is not None
+
+
+def _plain_mcap(folder: Path) -> list[Path]:
+    """Returns the files of a ROS 2 bag where all are MCAP and no message in them is packed by itself, else none."""
+    if not folder.is_dir() or _packs_messages(folder):
+        return []
+    unlisted = _unlisted(folder)
+    listed = [one for one in folder.iterdir() if one.name.lower().endswith(_IN_FOLDERS) and one.name not in unlisted]
+    return sorted(listed) if all(one.suffix == ".mcap" for one in listed) else []
+
+
 @contextmanager
 def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
@@ -181,12 +196,17 @@ def open_recording(path: Path) -> Iterator[Recording]:
     with _small_suffix(path) as called:
         with _damage_named(path):
             if called.suffix == ".mcap" and not called.is_dir():
-                reader: Any = McapReader(called)
+                reader: Any = McapReader([called])
+                topics = reader.topics
             else:
                 reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
                 reader.open()
+                topics = reader.topics
+                if files := _plain_mcap(called):
+                    reader.close()
+                    reader = McapReader(files)
         try:
-            yield Recording(path, reader)
+            yield Recording(path, reader, topics)
         finally:
             reader.close()
 
@@ -212,6 +232,8 @@ def _damage_named(path: Path) -> Iterator[None]:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         tool = _REPAIR_TOOLS.get(path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
+        if not path.is_dir() and _packs_messages(path.parent):
+            hint = f"; as the {_METADATA} beside it says, its messages are packed: name the folder {path.parent}"
         raise DataError(
             f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file{hint}"
         ) from None

@@ -18,7 +18,7 @@ from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.recordings.depth import read_recorded_depth
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.mcap_helpers import Layout, cloud, mcap, protobuf
-from tests.support.recording_helpers import START, Messages
+from tests.support.recording_helpers import START, Messages, write_recording
 
 pytest.importorskip("rosbags")
 RNG = np.random.default_rng(0)
@@ -198,3 +198,33 @@ def test_damaged_files_are_named(tmp_path, damage, said):
     path.write_bytes(data)
     with pytest.raises(DataError, match=f"not a readable recording .*{said}.*mcap recover"):
         read(path)
+
+
+@pytest.mark.parametrize("chunk", [0, 2])
+@pytest.mark.parametrize("summary", [(), ("channels", "statistics", "index"), ("schemas", "channels", "statistics")])
+def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_path, chunk, summary):
+    frames, stamps = frames_of(6), [START + 10**8 * t for t in range(6)]
+    make = messages_of(False)
+    content = [("/points", stamp, make.cloud(frame, stamp)) for frame, stamp in zip(frames, stamps)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    for part, places in enumerate(([2, 0, 1], [5, 4, 3])):
+        messages = [(0, stamps[t], ros_cloud(frames[t], stamps[t], False)) for t in places]
+        data = mcap([ros_channel(False)], messages, Layout(chunk, summary=summary, profile="ros2"))
+        (bag / f"run_{part}.mcap").write_bytes(data)
+    (bag / "run.mcap").unlink()
+    told = (bag / "metadata.yaml").read_text()
+    files = "  relative_file_paths:\n  - run_0.mcap\n  - run_1.mcap\n"
+    (bag / "metadata.yaml").write_text(told.replace("  relative_file_paths:\n  - run.mcap\n", files))
+    sample = read(bag)
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
+    np.testing.assert_allclose(sample.sequence.time, np.arange(6) / 10)
+    assert not sample.notes
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+def test_files_whose_messages_are_packed_name_the_folder_that_says_so(tmp_path, kind):
+    make = messages_of(False)
+    bag = write_recording(tmp_path / "run", kind, make, [("/points", START, make.cloud(frames_of(1)[0]))], "MESSAGE")
+    (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
+    with pytest.raises(DataError, match=f"its messages are packed: name the folder {bag}$"):
+        read(file)
