@@ -148,6 +148,16 @@ def _counted(foreign: Counter[str]) -> tuple[str, ...]:
     return tuple(counted(count, f"{suffix} file") for suffix, count in sorted(foreign.items()))
 
 
+def left_out_below(root: Path, read: tuple[str, ...]) -> list[str]:
+    """Returns a line for the log that counts the files of formats that aren't read below a folder, none where there are none.
+
+    read: suffixes of those formats that are read after all.
+    """
+    foreign = tuple(one for one in _FOREIGN if one not in read)
+    found = count_suffixes((name for _, _, files in walk_folders(root) for name in files), foreign)
+    return [f"left out: {', '.join(_counted(found))} ({_advice(found)})"] if found else []
+
+
 def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterator[tuple[Path, list[str], Counter[str]]]:
     """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
     are not read, by suffix; no folder that has neither.
