@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import heapq
 import os
+import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -25,6 +27,7 @@ from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _STATISTICS = 2, 3, 4, 5, 6, 8, 11
 _RECORD, _MESSAGE_HEAD, _CHUNK_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
+_IDL = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
 _ROS_SCHEMAS = ("ros1msg", "ros2msg", "ros2idl", "omgidl", "")
 
 
@@ -83,7 +86,7 @@ class McapReader:
         if channel.msgtype in LIVOX_KINDS:
             return read_livox(raw, ros1=ros1)
         if channel not in self._stores:
-            self._stores[channel] = _typestore(channel)
+            self._stores[channel] = _typestore(channel, self.connections)
         store = self._stores[channel]
         return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, channel.msgtype)
 
@@ -244,14 +247,29 @@ def _text(data: bytes | memoryview, at: int) -> tuple[str, int]:
     return part.decode("utf-8", "replace"), end
 
 
-def _typestore(channel: Channel) -> Any:
-    """Returns what knows the type of a channel of ROS: as the file describes it, else as ROS does."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+def _typestore(channel: Channel, others: Iterable[Channel]) -> Any:
+    """Returns what knows the type of a channel of ROS as the file describes it, else as ROS does.
+
+    others: channels whose descriptions may hold types that the channel's own one uses and lacks.
+    """
+    from rosbags.typesys import Stores, get_typestore
+
+    if not channel.definition:
+        return get_typestore(Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.LATEST)
+    types: dict[str, Any] = {}
+    for other in others:
+        with suppress(Exception):  # what is wrong with a topic that nobody asked for
+            types |= _types(other) if other.encoding == channel.encoding and other.definition else {}
+    store = get_typestore(Stores.EMPTY)
+    store.register(types | _types(channel))
+    return store
+
+
+def _types(channel: Channel) -> dict[str, Any]:
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     text = channel.definition.decode("utf-8", "replace")
-    if not text:
-        return get_typestore(Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.LATEST)
-    store = get_typestore(Stores.EMPTY)
-    idl = channel.form.endswith("idl")
-    store.register(get_types_from_idl(text) if idl else get_types_from_msg(text, channel.msgtype))
-    return store
+    if not channel.form.endswith("idl"):
+        return get_types_from_msg(text, channel.msgtype)
+    parts = _IDL.split(text)  # of one type each
+    return {name: one for part in parts if part.strip() for name, one in get_types_from_idl(part).items()}

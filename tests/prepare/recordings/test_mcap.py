@@ -66,6 +66,25 @@ def ros_channel(ros1: bool) -> tuple[str, str, str, str, str]:
     return ("/points", "ros1" if ros1 else "cdr", name, "ros1msg" if ros1 else "ros2msg", described)
 
 
+def idl_of_a_cloud() -> str:
+    """A PointCloud2 and what it uses as IDL, as ROS 2 describes types that were defined so."""
+    parts = {
+        "sensor_msgs/msg/PointCloud2": "std_msgs::msg::Header header; unsigned long height; unsigned long width;"
+        " sequence<sensor_msgs::msg::PointField> fields; boolean is_bigendian; unsigned long point_step;"
+        " unsigned long row_step; sequence<uint8> data; boolean is_dense;",
+        "sensor_msgs/msg/PointField": "string name; unsigned long offset; uint8 datatype; unsigned long count;",
+        "std_msgs/msg/Header": "builtin_interfaces::msg::Time stamp; string frame_id;",
+        "builtin_interfaces/msg/Time": "int32 sec; uint32 nanosec;",
+    }
+    described = ""
+    for name, fields in parts.items():
+        package, _, last = name.split("/")
+        described += (
+            f"{'=' * 80}\nIDL: {name}\nmodule {package} {{ module msg {{ struct {last} {{ {fields} }}; }}; }};\n"
+        )
+    return described
+
+
 def read(path, **options):
     reader = RecordedClouds(path, **options)
     return reader.read(reader.items()[0], RNG)
@@ -73,16 +92,17 @@ def read(path, **options):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    encoding=st.sampled_from(["ros1", "cdr", "protobuf", "json"]),
+    encoding=st.sampled_from(["ros1", "cdr", "idl", "protobuf", "json"]),
     layout=LAYOUTS,
     order=st.permutations(range(5)),
     other=st.booleans(),
 )
 def test_every_layout_and_encoding_holds_what_was_written(tmp_path, encoding, layout, order, other):
-    kind = XYZ if encoding in ("ros1", "cdr") else LOOSE
+    kind = LOOSE if encoding in ("protobuf", "json") else XYZ
     frames, stamps = frames_of(5, kind), [START + 10**8 * t + t**2 for t in range(5)]
-    if encoding in ("ros1", "cdr"):
+    if kind is XYZ:
         channels = [ros_channel(encoding == "ros1")]
+        channels = [(*channels[0][:3], "ros2idl", idl_of_a_cloud())] if encoding == "idl" else channels
         raw = [ros_cloud(frame, stamp, encoding == "ros1") for frame, stamp in zip(frames, stamps)]
     else:
         channels = [("/points", encoding, FOXGLOVE, "", "")]
@@ -102,6 +122,16 @@ def test_every_layout_and_encoding_holds_what_was_written(tmp_path, encoding, la
         np.testing.assert_array_equal(
             sample.sequence.extra["field_ring"], np.concatenate([f["ring"] for f in frames]).astype(np.float32)
         )
+
+
+def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path):
+    topic, *kind, described = ros_channel(False)
+    header = described[: described.index("=" * 80)]
+    (frame,) = frames_of(1)
+    path = tmp_path / "run.mcap"
+    channels = [(topic, *kind, header), ("/other", *kind, described), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
+    path.write_bytes(mcap(channels, [(0, START, ros_cloud(frame, START, False))]))
+    np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
