@@ -30,7 +30,7 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
-    " .pcap .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
+    " .pcap .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
     " .jsonl .ndjson"
