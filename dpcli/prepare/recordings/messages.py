@@ -126,9 +126,10 @@ def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
     return image
 
 
-def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration | None:
+def calibration_of_message(path: Path, topic: str, content: Any, lens_model: str = "") -> Calibration | None:
     """Returns the camera of a CameraInfo for the images of ``topic``; None when it says that it isn't calibrated.
 
+    lens_model: of its lens, "" for the one that it tells.
     For rectified images (``rect`` in the name of the topic) its projection P counts, else its K and lens.
     """
     # ROS 1 has them in capitals
@@ -141,7 +142,7 @@ def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration 
         return None
     roi = content.roi  # a cut-out of the picture that the numbers are for; none where its size is 0
     numbers[2:] = numbers[2] - roi.x_offset, numbers[3] - roi.y_offset
-    bent = () if rectified else lens_coefficients(path, str(content.distortion_model), lens)
+    bent = () if rectified else lens_coefficients(path, lens_model or str(content.distortion_model), lens)
     camera = LensIntrinsics(*numbers, bent) if bent else Intrinsics(*numbers)
     size = int(roi.width or content.width), int(roi.height or content.height)
     return Calibration(camera, *size, source=f"{path}: camera_info")
