@@ -6,14 +6,16 @@ import base64
 import json
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import numpy as np
+import pytest
 
 MAGIC = b"\x89MCAP0\r\n"
-PACKERS = {"lz4": "lz4.frame", "zstd": "backports.zstd"}
+PACKERS = {"lz4": ["lz4.frame"], "zstd": ["compression.zstd", "backports.zstd"]}  # Python's own, or what rosbags needs
 NUMBERS = {"u1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
 
 
@@ -63,7 +65,7 @@ def mcap(
         times = min(time for _, time, _ in some), max(time for _, time, _ in some)
         packed = inner
         if layout.packing in PACKERS:
-            packed = import_module(PACKERS[layout.packing]).compress(inner)
+            packed = _packer(layout.packing).compress(inner)
         head = struct.pack("<QQQI", *times, len(inner), zlib.crc32(inner)) + text(layout.packing)
         chunk = record(6, head, struct.pack("<Q", len(packed)), packed)
         offsets = b"".join(struct.pack("<HQ", number, 0) for number in sorted({number for number, *_ in some}))
@@ -78,6 +80,13 @@ def mcap(
     summary = b"".join(every[name] for name in layout.summary)
     start = len(data) if summary else 0
     return data + summary + record(2, struct.pack("<QQI", start, 0, 0)) + MAGIC
+
+
+def _packer(name: str) -> Any:
+    for module in PACKERS[name]:
+        with suppress(ImportError):
+            return import_module(module)
+    return pytest.importorskip(PACKERS[name][-1])
 
 
 def protobuf(*fields: tuple[int, Any]) -> bytes:

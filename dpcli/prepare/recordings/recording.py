@@ -126,10 +126,11 @@ class Recording:
     def _list(self, fitting: list[str], what: str) -> str:
         if fitting:
             return f"choose one that holds {what} with --topic: {first_names(fitting, _LISTED)}"
-        held = first_names([f"{name} ({kind})" for name, (kind, _) in self.topics.items()], _LISTED)
-        told = f"no topic holds {what}; it has {held or 'no messages'}"
+        told = [f"{name} ({kind}{'' if count else ', no messages'})" for name, (kind, count) in self.topics.items()]
+        held = first_names(told, _LISTED)
+        said = f"no topic holds {what}; it has {held or 'no messages'}"
         tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
-        return f"{told}; if its index is not whole, {tool} makes it" if tool and not held else told
+        return f"{said}; if its index is not whole, {tool} makes it" if tool and not held else said
 
     def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
         """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""

@@ -207,8 +207,12 @@ def test_a_point_of_foxglove_that_was_cut_is_named(tmp_path):
 def test_encodings_that_are_not_read_are_named(tmp_path):
     path = tmp_path / "run.mcap"
     channels = [("/points", "flatbuffer", FOXGLOVE, "flatbuffer", ""), ("/scan", "json", "foxglove.LaserScan", "", "")]
+    channels.append(("/empty", "json", FOXGLOVE, "", ""))
     path.write_bytes(mcap(channels, [(0, START, b"abc"), (1, START, b"{}")]))
-    with pytest.raises(DataError, match=r"it has /points \(foxglove.PointCloud in flatbuffer\), /scan"):
+    said = (
+        r"it has /points \(foxglove.PointCloud in flatbuffer\), /scan .*, /empty \(foxglove.PointCloud, no messages\)"
+    )
+    with pytest.raises(DataError, match=said):
         read(path)
 
 
