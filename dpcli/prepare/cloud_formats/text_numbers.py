@@ -300,9 +300,14 @@ def _with_units(table: TextTable) -> TextTable:
 
 
 def _with_row_names(table: TextTable, rows: list[tuple[int, str]]) -> TextTable:
-    """Returns the table, its first column taken for the names of rows where the header has none for it, as R writes it: they
-    count the rows, or are quoted, unlike numbers behind them, and differ (those of a part of a table count in the whole).
+    """Returns the table, its first column taken for the names of rows where the header has none for it, as R writes it, and
+    pandas between blanks: they count the rows, or are quoted, unlike numbers behind them, and differ (those of a part of a
+    table count in the whole).
     """
+    if table.names and rows and len(table.cells(rows[0][1])) == len(table.names) + 1 and table.delimiter is None:
+        some = [table.cells(row)[0] for _, row in table.first_rows(_LOOKED_AT)]  # 0 and 1 alone may be x of a grid
+        if len(some) > 2 and some == [str(k) for k in range(len(some))]:
+            return replace(table, names=("", *table.names))
     unnamed = [cells[0] for _, row in rows if len(cells := _trimmed(table.cells(row))) == len(table.names) + 1]
     quoted = all(row.startswith('"') and row.count('"') <= 2 * len(table.names) for _, row in rows)
     quoted = quoted and len(set(unnamed)) == len(rows)
