@@ -25,6 +25,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
+_OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -209,10 +210,13 @@ def _refuse_filters(item: h5py.Dataset, path: Path) -> None:
 
 
 def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
-    """Returns the data sets in a file by name, each once; links to other files are not followed."""
+    """Returns the data sets in a file by name, each once, those of Octave by the names of its variables; links to other files
+    are not followed.
+    """
     import h5py
 
     found: list[tuple[str, h5py.Dataset]] = []
+    of_octave = {name for name, item in file.items() if _OCTAVE in item.attrs}
 
     def note(name: str, item: Any) -> None:
         if len(found) > _MOST:
@@ -220,10 +224,21 @@ def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # #refs#, the contents of MATLAB's cells
             if item.is_virtual or item.external:
                 raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
-            found.append((name, item))
+            own = _name_in_octave(name) if name.split("/")[0] in of_octave else name
+            found.extend([(own, item)] if own else [])
 
     file.visititems(note)
     return found
+
+
+def _name_in_octave(name: str) -> str:
+    """Returns what Octave calls the data set of a variable, a field or a cell; "" of those that tell its type or size.
+
+    >>> _name_in_octave("s/value/points/value"), _name_in_octave("points/value/_01/value"), _name_in_octave("s/type")
+    ('s/points', 'points/_01', '')
+    """
+    parts = name.split("/")
+    return "/".join(parts[::2]) if len(parts) % 2 == 0 and set(parts[1::2]) == {"value"} else ""
 
 
 def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> list[np.ndarray] | None:

@@ -27,6 +27,7 @@ _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
 _TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
 _SAMPLED, _SURELY_APART = 4096, 0.4  # values of an axis that are looked at; nats a value that leave no doubt
+_CLOUDCOMPARE = b"CCB"  # the first bytes of projects, which CloudCompare calls .bin, too
 _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
 
 
@@ -129,6 +130,11 @@ def _counts_rows(array: np.ndarray) -> bool:
 def read_bin(path: Path, columns: int) -> Cloud:
     """Reads float32 values, ``columns`` for each point, x y z first."""
     size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(len(_CLOUDCOMPARE)) == _CLOUDCOMPARE:
+            raise DataError(
+                f"{path}: CloudCompare's own .bin, which is not read; save its clouds as .ply with CloudCompare"
+            )
     if size % (4 * columns):
         raise DataError(
             f"{path}: {size} bytes are no whole number of points of {columns} float32; truncated, or see --bin-columns"

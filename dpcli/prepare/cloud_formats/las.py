@@ -30,6 +30,7 @@ _RECORD, _LATE_RECORD = 54, 60  # bytes at least of a record before the points, 
 _FINE = 1e-6  # of degrees a decimeter
 _FINEST, _COARSEST = 1e-15, 1e15  # of a number of the file, in units of length
 _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
+_NAMED_FEET = {"ft": "ft", "ftUS": "us-ft"}  # as the names of reference systems end
 
 
 def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -167,7 +168,23 @@ def _units(path: Path, las: Any) -> tuple[str, str]:
         )
         if found and found[0]:
             return found[0], found[-1] or found[0]
-    return "", ""
+    texts = "|".join(text for record in las.header.vlrs for text in getattr(record, "strings", []))
+    told = next((units for name in texts.split("|") if (units := units_of_name(name))), ["", ""])
+    return told[0], told[-1]
+
+
+def units_of_name(name: str) -> list[str]:
+    """Returns the units on the map and, where it names heights, of these, of a reference system that EPSG calls so; [] of one
+    without feet. It is all that tells them where a GeoTIFF gives the system by its number alone, as laspy writes it.
+
+    >>> units_of_name("NAD83 / New York Long Island (ftUS) + NAVD88 height"), units_of_name("NAD83 / Arizona East (ft)")
+    (['us-ft', 'm'], ['ft'])
+    >>> units_of_name("NAD83 / UTM zone 18N"), units_of_name("NAVD88 height (ftUS)")
+    ([], [])
+    """
+    parts = name.split(" + ")
+    told = [_NAMED_FEET[found[1]] if (found := re.search(r"\((ft|ftUS)\)", part)) else "m" for part in parts]
+    return told if " / " in parts[0] and set(told) != {"m"} else []
 
 
 def _is_geographic(text: str) -> bool:

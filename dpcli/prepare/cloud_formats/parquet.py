@@ -14,6 +14,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 
 COLUMNAR = (".parquet", ".feather", ".arrow")
 _CELL = 8  # bytes of a number
+_DAY = 86_400.0  # seconds
 
 
 class ParquetTable:
@@ -74,6 +75,8 @@ class ParquetTable:
         """Returns the seconds f64 (N) since the first of a column of times or durations, NaN where it is empty; None of other
         types.
         """
+        import pyarrow.types as types
+
         column = self._table.column(place)
         parts = _parts_of_second(column.type)
         if not parts:
@@ -82,7 +85,22 @@ class ParquetTable:
         whole = column.cast(kind)
         first = next((value for value in whole.to_pylist() if value is not None), 0)
         counted = (whole.fill_null(first).to_numpy() - first) / parts
+        counted = past_midnight(counted) if types.is_time(column.type) else counted
         return np.where(column.is_valid().to_numpy(), counted, np.nan)
+
+
+def past_midnight(seconds: np.ndarray) -> np.ndarray:
+    """Returns times of day f64 (N), in seconds, as times that go on: where one that is new falls by more than half a day, a day
+    begins.
+
+    >>> past_midnight(np.array([86399.0, 86399.0, 0.5, 86399.0, 1.0])).tolist()
+    [86399.0, 86399.0, 86400.5, 86399.0, 86401.0]
+    """
+    _, first, place = np.unique(seconds, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    days = np.zeros(len(first))
+    days[order] = np.append(0, np.cumsum(np.diff(seconds[first[order]]) < -_DAY / 2))[: len(first)]
+    return seconds + days[place] * _DAY
 
 
 def _parts_of_second(kind: Any) -> int:

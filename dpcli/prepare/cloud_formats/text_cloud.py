@@ -96,7 +96,7 @@ def _rows_of_off(path: Path, found: list[list[str]]) -> list[list[str]]:
     """Returns the words of the vertices' rows of an OFF file. Raises DataError where it holds other counts than it says."""
     first, *rows = found or [[""]]
     counts, rows = (first[1:], rows) if len(first) > 1 else (rows[0] if rows else [], rows[1:])
-    if not re.fullmatch(r"(ST)?C?N?OFF", first[0]) or len(counts) < 2 or not all(map(str.isdecimal, counts[:2])):
+    if not re.fullmatch(r"(ST)?(C?N?|NC)OFF", first[0]) or len(counts) < 2 or not all(map(str.isdecimal, counts[:2])):
         raise DataError(f"{path}: no OFF file in text; expected OFF, the numbers of vertices and faces, and their rows")
     vertices, faces = map(int, counts[:2])
     if len(rows) != vertices + faces:

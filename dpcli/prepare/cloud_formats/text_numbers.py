@@ -300,9 +300,18 @@ def _with_units(table: TextTable) -> TextTable:
 
 
 def _with_row_names(table: TextTable, rows: list[tuple[int, str]]) -> TextTable:
-    """Returns the table, its first column taken for the names of rows where the header has none for it, as R writes it."""
+    """Returns the table, its first column taken for the names of rows where the header has none for it, as R writes it, and
+    pandas between blanks: they count the rows, or are quoted, unlike numbers behind them, and differ (those of a part of a
+    table count in the whole).
+    """
+    if table.names and rows and len(table.cells(rows[0][1])) == len(table.names) + 1 and table.delimiter is None:
+        some = [table.cells(row)[0] for _, row in table.first_rows(_LOOKED_AT)]  # 0 and 1 alone may be x of a grid
+        if len(some) > 2 and some == [str(k) for k in range(len(some))]:
+            return replace(table, names=("", *table.names))
     unnamed = [cells[0] for _, row in rows if len(cells := _trimmed(table.cells(row))) == len(table.names) + 1]
-    if not table.names or len(unnamed) != len(rows) or unnamed != ["1", "2"][: len(rows)]:
+    quoted = all(row.startswith('"') and row.count('"') <= 2 * len(table.names) for _, row in rows)
+    quoted = quoted and len(set(unnamed)) == len(rows)
+    if not table.names or len(unnamed) != len(rows) or not (quoted or unnamed == ["1", "2"][: len(rows)]):
         return table
     return replace(table, names=("", *table.names))
 
@@ -376,7 +385,7 @@ def delimiter_of(line: str) -> str | None:
         return sign
     if "," not in line:
         return None
-    *words, last = line.split()
+    *words, last = re.sub(r'(?<!\S)"[^"]*"(?!\S)', "0", line).split()  # the names of rows, and other texts
     decimal = len(words) >= 2 and all(re.fullmatch(_NUMBER, word) for word in (*words, last))
     return None if decimal and not all(word.endswith(",") for word in words) else ","
 

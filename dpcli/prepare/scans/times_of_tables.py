@@ -42,7 +42,7 @@ _NO_UNITS = _TIME_WORDS | {"gps", "unix", "posix", "local", "sensor", "since", "
 _SEVERAL = re.compile(r"[\[(]\s*([\d.]+)\s*([^\W\d]+)\s*[\])]\s*$")  # such as [100 ns]
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?\s*$")
 _CLOCK = re.compile(
-    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(\d+) days?,? )?"  # a date, or a number of days
+    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*|(-?\d+) days?,? \+?)?"  # a date, or a number of days
     r"(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(?:([AP])\.?M\.?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
@@ -224,6 +224,8 @@ def clock_seconds(words: Sequence[str]) -> list[float]:
 
     >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["1 days 00:00:01"]), clock_seconds(["a"])
     ([86399.5, 86400.0], [86401.0], [])
+    >>> clock_seconds(["-1 days +23:59:59.5", "0 days 00:00:01"])  # as pandas writes a duration below 0
+    [-0.5, 1.0]
     >>> clock_seconds(["31.12.2023 23:59:59", "01.01.2024 00:00:01"])
     [1704067199.0, 1704067201.0]
     >>> clock_seconds(["11:59:59 AM", "12:00:01 PM", "1:00:00 PM"])

@@ -141,3 +141,33 @@ def test_what_every_sequence_of_a_file_reads_is_not_named(tmp_path):
         reader = ArraySequences(tmp_path / name)
         items = reader.items()
         assert len(items) == 2 and reader.summary(items)[0].endswith(said)
+
+
+@pytest.mark.parametrize("suffix", ["h5", "mat"])
+def test_variables_of_octave_have_their_own_names(tmp_path, suffix):
+    """Those that `save -hdf5` writes lie in groups beside their types, fields and cells in groups below: times are found."""
+
+    def save(place, values):
+        group = place.create_group("time" if values.ndim < 3 else "points")
+        group.attrs["OCTAVE_NEW_FORMAT"] = np.uint8(1)
+        group["type"], group["value"] = np.bytes_("matrix"), values
+
+    path = tmp_path / f"a.{suffix}"
+    for field in (False, True):
+        with h5py.File(path, "w") as file:
+            place = file
+            if field:
+                outer = file.create_group("s")
+                outer.attrs["OCTAVE_NEW_FORMAT"] = np.uint8(1)
+                outer["type"] = np.bytes_("scalar struct")
+                place = outer.create_group("value")
+            save(place, clouds().transpose(0, 2, 1).astype(np.float64))  # points, axes, frames as Octave has them
+            save(place, np.arange(6.0)[None] / 10)
+        with open_arrays(path) as arrays:
+            assert sorted(arrays) == (["s/points", "s/time"] if field else ["points", "time"])
+        reader = ArraySequences(path)
+        items = reader.items()
+        assert "not read" not in reader.summary(items)[0]
+        sequence = reader.read(items[0], np.random.default_rng(0)).sequence
+        assert np.array_equal(sequence.points.reshape(6, -1, 3), clouds())
+        np.testing.assert_allclose(sequence.time, np.arange(6) / 10)

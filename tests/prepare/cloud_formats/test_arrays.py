@@ -208,6 +208,14 @@ def test_a_count_before_the_points_is_no_coordinate(tmp_path):
         CloudFolders(tmp_path).read(CloudFolders(tmp_path).items()[0], np.random.default_rng(0))
 
 
+@pytest.mark.parametrize("size", [12_185, 12_192, 12_288])  # of which the second and the third are whole points
+def test_a_bin_of_cloudcompare_is_called_so(tmp_path, size):
+    head = b"CCB2" + np.uint32(50).tobytes() + b"\x01\x01" + bytes(6)
+    (tmp_path / "0.bin").write_bytes((head + scan(3, 1100, 0).astype("<f4").tobytes())[:size])
+    with pytest.raises(DataError, match="CloudCompare's own .bin, .* save its clouds as .ply"):
+        CloudFolders(tmp_path).read(CloudFolders(tmp_path).items()[0], np.random.default_rng(0))
+
+
 def test_damaged_arrays_are_named(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.ones((4, 3), np.float32))

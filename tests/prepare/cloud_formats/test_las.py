@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
+from laspy.vlrs.known import GeoAsciiParamsVlr, GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.colors import as_bytes
@@ -116,6 +116,36 @@ def test_heights_of_another_unit_than_the_map(tmp_path, told):
     reader = CloudFolders(tmp_path / "in")
     found = reader.read(reader.items()[0], np.random.default_rng(0)).sequence.points
     np.testing.assert_allclose(found, points * [1200 / 3937, 1200 / 3937, 1], atol=1e-4)
+
+
+FEET = 1200 / 3937
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "sizes"),
+    [
+        ("NAD83 / New York Long Island (ftUS)", None, [FEET, FEET, FEET]),
+        ("NAD83 / Arizona East (ft)|NAD83|", None, [0.3048, 0.3048, 0.3048]),
+        ("NAD83 / New York Long Island (ftUS) + NAVD88 height", None, [FEET, FEET, 1]),
+        ("NAD83 / UTM zone 18N + NAVD88 height (ftUS)", None, [1, 1, FEET]),
+        ("NAD83 / UTM zone 18N|NAD83|NAVD88 height (ftUS)|", None, [1, 1, 1]),
+        ("NAD83 / New York Long Island (ftUS)", 9001, [1, 1, 1]),
+    ],
+)
+def test_units_that_only_the_name_of_a_system_tells(tmp_path, name, unit, sizes):
+    """As laspy's `add_crs` writes it: the number of a system, its name, and no unit, which goes before where it is there."""
+    points = np.random.default_rng(0).uniform(0, 20, (30, 3))
+    las = make(1, points, 1e-4)
+    directory, texts = GeoKeyDirectoryVlr(), GeoAsciiParamsVlr()
+    keys = [(1024, 0, 1), (3072, 0, 2263), (3073, 34737, len(name)), *([(3076, 0, unit)] if unit else [])]
+    directory.geo_keys = [GeoKeyEntryStruct(key, place, 1, value) for key, place, value in keys]
+    directory.geo_keys_header.number_of_keys, texts.strings = len(keys), [name]
+    las.header.vlrs.extend([directory, texts])
+    (tmp_path / "in").mkdir()
+    las.write(str(tmp_path / "in" / "0.las"))
+    reader = CloudFolders(tmp_path / "in")
+    found = reader.read(reader.items()[0], np.random.default_rng(0)).sequence.points
+    np.testing.assert_allclose(found, points * sizes, atol=1e-4)
 
 
 @pytest.mark.parametrize(

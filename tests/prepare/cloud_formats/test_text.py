@@ -15,7 +15,7 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, COUNTED, EMPTY, read_text
+from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, COUNTED, EMPTY, read_text, read_vertices
 from dpcli.prepare.cloud_formats.text_numbers import CUT
 from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.reader import Item
@@ -75,6 +75,11 @@ def test_what_csv_writers_write_is_read_back(tmp_path, data):
         ",0,1,2,3\n0,0.126,-0.132,0.64,9\n1,0.105,-0.536,0.362,9\n2,-1.265,-0.623,0.041,8\n",
         "1 0.126 -0.132 0.64\n2 0.105 -0.536 0.362\n3 -1.265 -0.623 0.041\n",
         '"x" "y" "z"\n"1" 0.126 -0.132 0.64\n"2" 0.105 -0.536 0.362\n"3" -1.265 -0.623 0.041\n',
+        " x y z\n0 0.126 -0.132 0.64\n1 0.105 -0.536 0.362\n2 -1.265 -0.623 0.041\n",
+        "       x      y      z\n0  0.126 -0.132  0.640\n1  0.105 -0.536  0.362\n2 -1.265 -0.623  0.041\n",
+        '"x" "y" "z" "c"\n"51" 0.126 -0.132 0.64 "a"\n"57" 0.105 -0.536 0.362 "b"\n"58" -1.265 -0.623 0.041 "a"\n',
+        '"x";"y";"z"\n"p1";0,126;-0,132;0,64\n"p2";0,105;-0,536;0,362\n"p3";-1,265;-0,623;0,041\n',
+        '"x" "y" "z" "c"\n"1" 0,126 -0,132 0,64 "a"\n"2" 0,105 -0,536 0,362 "b"\n"3" -1,265 -0,623 0,041 "a"\n',
         "x,y,z\n0.126,\u22120.132,0.64\n0.105,\u22120.536,0.362\n\u22121.265,\u22120.623,0.041\n",
         "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
     ],
@@ -113,6 +118,12 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("1,5, 2,25, 3,5\n4,5, 5,25, 6,5\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
+        (
+            '"x","y","z"\n"1.5","2.5","3.5","4"\n"5.5","6.5","7.5","8"\n',
+            "a.csv:2: 4 values; expected .*3 as in the header",
+        ),
+        ("x y z\n0 0 1 5\n1 0 1 5\n0 1 1 5\n", "a.csv:2: 4 values; expected .*3 as in the header"),
+        ('"x" "y" "z"\n"car" 1.5 2.5 3.5\n"car" 5.5 6.5 7.5\n', "a.csv:2: 4 values; expected .*3 as in the header"),
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
         ("x;y;z\n448.262.123;2;0.512\n", "numbers such as 448.262.123 beside 0.512; expected one style"),
         ("x y z\n1 2 3\n1.2.3 2 3.5\n", "a.csv:3: column 'x' holds '1.2.3'"),
@@ -411,3 +422,13 @@ def test_names_that_mean_something_else():
     assert find_axes(["x", "-y", "z"]) is None and find_axes(["-x [m]", "\u2212y [m]", "z [m]"]) is None
     assert find_colors(["r", "azimuth", "g"]) == [] and find_colors(["x", "Red", "Green", "Blue"]) == [1, 2, 3]
     assert find_frame_column(["scan", "frame_id", "x"]) == "frame_id" and find_frame_column(["x", "time"]) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "further"), [("NCOFF", "9 8 7 255 0 0 1"), ("CNOFF", "0 0 1 9 8 7 255"), ("STCNOFF", "0 0 1")]
+)
+def test_places_come_first_in_every_off(tmp_path, kind, further):
+    """MeshLab calls meshes with normals and colors NCOFF, and Geomview CNOFF."""
+    rows = [f"{' '.join(map(str, point))} {further}" for point in POINTS]
+    (tmp_path / "a.off").write_text("\n".join([kind, f"{len(rows)} 1 0", *rows, "3 0 1 2", ""]))
+    assert np.array_equal(read_vertices(tmp_path / "a.off").points, POINTS)

@@ -196,3 +196,36 @@ def test_structures_are_columns_and_lists_are_named(tmp_path):
     parquet.write_table(pyarrow.table({"frame": [0, 1], **lists}), tmp_path / "b.parquet")
     (item,) = TableSequences(tmp_path / "b.parquet").items()
     assert "column 'x' holds lists; expected a row for each point" in item.problem
+
+
+@pytest.mark.parametrize("column", ["clock", "time"])
+@pytest.mark.parametrize("unit", ["time32[s]", "time64[ns]"])
+def test_times_of_day_of_any_type_pass_midnight(tmp_path, column, unit):
+    """Whether they number the frames or stand beside their numbers, a table in Parquet is read as the same table in a text is."""
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    seconds = [86_398, 86_398, 86_399, 0, 0, 2]
+    x, frame = np.arange(6.0), np.repeat([0, 1, 2, 3], [2, 1, 2, 1])
+    words = [f"{s // 3600:02d}:{s // 60 % 60:02d}:{s % 60:02d}" for s in seconds]
+    csv(tmp_path / "a.csv", f"frame,{column},x,y,z", zip(frame, words, x, x, x))
+    name, part = unit.rstrip("]").split("[")
+    times = pyarrow.array([s * (10**9 if part == "ns" else 1) for s in seconds], f"int{name[4:]}")
+    times = times.cast(getattr(pyarrow, name)(part))
+    columns = {"frame": frame, column: times, "x": x, "y": x, "z": x}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "b.parquet")
+    for place in ("a.csv", "b.parquet"):
+        sequence, _ = only_sequence(tmp_path / place, frame_column=column if column == "clock" else "frame")
+        assert sequence.points[:, 0].tolist() == x.tolist(), place
+        assert sequence.frame_offsets.tolist() == [0, 2, 3, 5, 6], place
+        np.testing.assert_allclose(sequence.time, [0, 1, 2, 4], atol=1e-9, err_msg=place)
+
+
+def test_durations_below_0_as_pandas_writes_them(tmp_path):
+    words = ["0 days 00:00:00.250000", "-1 days +23:59:59.750000", "-1 day, 23:59:59.900000"]
+    sequence, _ = only_sequence(
+        csv(tmp_path / "a.tsv", "since\tx\ty\tz", [[f"{w}\t1\t2\t{k}"] for k, w in enumerate(words)]),
+        frame_column="since",
+    )
+    assert sequence.points[:, 2].tolist() == [1, 2, 0]
+    np.testing.assert_allclose(sequence.time, [0, 0.15, 0.5], atol=1e-9)
