@@ -197,6 +197,11 @@ def _remove_unread(root: Any) -> None:
                 inner.tag not in _READ[element.tag] or drawn and inner.tag == "collision"
             ):
                 element.remove(inner)
+    for geometry in root.iter("geometry"):  # some put a material into it
+        inside = [element for element in geometry if isinstance(element.tag, str)]
+        if any(element.tag in _SHAPES for element in inside):
+            for unread in (element for element in inside if element.tag not in _SHAPES):
+                geometry.remove(unread)
     for still in root.iterfind("joint[@type='fixed']"):
         for unread in [*still.findall("axis"), *still.findall("limit")]:
             still.remove(unread)
