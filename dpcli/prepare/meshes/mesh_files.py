@@ -200,6 +200,10 @@ def _check_collada(path: Path) -> None:
         raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
     if re.search(rb"<(\w+:)?ph\b", data):
         raise DataError(f"{path}: it has polygons with holes, which are not read; export it as triangles")
+    if name := _spread_positions(data):
+        raise DataError(
+            f"{path}: the positions of {name!r} lie between other numbers, which is not read; export it again"
+        )
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return
@@ -217,6 +221,23 @@ def _check_collada(path: Path) -> None:
         corners = np.split(np.asarray(one.vertex_index), np.cumsum(one.vcounts)[:-1])
         if not all(_are_convex(one.vertex[group]).all() for group in _by_size(corners).values()):
             raise DataError(f"{path}: some of its polygons aren't convex; export it again as triangles")
+
+
+def _spread_positions(data: bytes) -> str:
+    """Returns the id of a source of positions in a COLLADA file that are not every three numbers of its array in turn, as the
+    reader takes them; else nothing.
+    """
+    from lxml import etree
+
+    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    for mesh in root.iterfind(".//{*}mesh"):  # exporters give one id to sources of several
+        named = {one.get("source") for one in mesh.iterfind("{*}vertices/{*}input[@semantic='POSITION']")}
+        for source in mesh.iterfind("{*}source"):
+            accessor = source.find("{*}technique_common/{*}accessor")
+            given = ("0", "3") if accessor is None else (accessor.get("offset", "0"), accessor.get("stride", "3"))
+            if f"#{source.get('id')}" in named and tuple(map(str.strip, given)) != ("0", "3"):
+                return str(source.get("id"))
+    return ""
 
 
 def _mesh_of(polygons: Polygons) -> Any:

@@ -106,6 +106,12 @@ LAMP = '<node id="lamp"><instance_light url="#gone"/></node>'
         ('target="#', 'target="#gone', "Material #gone"),
         ("<triangles", "<linestrips/><triangles", "Geometry #"),
         ("<triangles", "<polygons><ph/></polygons><triangles", "polygons with holes"),
+        (
+            'count="8" source="#verts-array-array" stride="3"',
+            'count="6" source="#verts-array-array" stride="4"',
+            "positions of",
+        ),
+        ('count="8" source="#verts', 'count="7" offset="3" source="#verts', "positions of 'verts-array' lie between"),
         ("<instance_geometry", "<skew>45 0 1 0 1 0 0</skew><instance_geometry", "skew"),
         ("<instance_geometry", "<translate>1 two 3</translate><instance_geometry", "translate"),
     ],
