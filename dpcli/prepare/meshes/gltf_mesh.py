@@ -414,7 +414,7 @@ def _repaired(
         local, weights = local.copy(), weights.copy()
         local[lost], weights[lost] = local[near], weights[near]
     weights = weights / weights.sum(1, keepdims=True)
-    return np.where(weights > 0, local, 0), weights
+    return np.where(weights != 0, local, 0), weights
 
 
 def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
