@@ -39,8 +39,9 @@ _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
 _LOST = re.compile(  # what pycollada says where a mesh, or how it is turned, is missing, not a lamp or a picture
-    r"(Geometry|Material|Node) \S+ not found|skew|transform|node requires|(geometry|node) instance|id in material"
+    r"(Geometry|Node) \S+ not found|skew|transform|node requires|(geometry|node) instance"
 )
+_COLORED = re.compile(rb"<((?:\w+:)?bind_material)\b[^>]*?(?:/>|>.*?</\1>)", re.DOTALL)  # no shape depends on it
 _SOLID = rb"(?i)\s*solid"
 _SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
@@ -122,13 +123,14 @@ def _read_dae(path: Path, root: Path | None) -> Any:
     from collada.common import DaeError
 
     _check_collada(path)
+    data = _COLORED.sub(b"", path.read_bytes())
     try:
-        return _by_trimesh(path, root, ignore_broken=False)
+        return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="dae", ignore_broken=False)
     except (DaeError, RuntimeError):  # perhaps of a lamp or a picture alone; the second where it raises nothing again
-        lost = [one.msg for one in Collada(str(path), ignore=[DaeError]).errors if _LOST.search(one.msg)]
+        lost = [one.msg for one in Collada(BytesIO(data), ignore=[DaeError]).errors if _LOST.search(one.msg)]
     if lost:
         raise DataError(f"{path}: a part of it would be left out ({lost[0]:.100}); repair it, or export it again")
-    return _by_trimesh(path, root)
+    return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="dae")
 
 
 def _files_inside(path: Path, root: Path | None) -> Any:

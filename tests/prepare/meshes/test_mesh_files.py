@@ -103,7 +103,7 @@ LAMP = '<node id="lamp"><instance_light url="#gone"/></node>'
     [
         ("</visual_scene>", f"{LAMP}</visual_scene>", ""),
         ("</visual_scene>", '<node id="n"><instance_geometry url="#gone"/></node></visual_scene>', "Geometry #gone"),
-        ('target="#', 'target="#gone', "Material #gone"),
+        ('target="#', 'target="#gone', ""),  # a color
         ("<triangles", "<linestrips/><triangles", "Geometry #"),
         ("<triangles", "<polygons><ph/></polygons><triangles", "polygons with holes"),
         (
