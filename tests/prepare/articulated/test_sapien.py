@@ -459,7 +459,8 @@ ODD = {
     "geometry": '<material name="grey"/><drake:declare_convex/>',
     "joint": '<dynamics damping="" friction="a"/><safety_controller soft_lower_limit="x"/><calibration rising="x"/>',
     "limit": 'effort="unlimited" drake:acceleration="40" ',
-    "robot": '<drake:collision_filter_group name="g"/><transmission><joint/></transmission><gazebo><plugin filename="$(find x)"/></gazebo><sensor type="q"/>'
+    "robot": '<drake:collision_filter_group name="g"/>'
+    '<transmission><joint/></transmission><gazebo><plugin filename="$(find x)"/></gazebo><sensor type="q"/>'
     '<material name="q"><color rgba="1,0,0,1"/></material>',
 }
 
