@@ -198,6 +198,7 @@ def lost_picture(file: GlbFile) -> None:
         (hidden, 4),
         (lost_picture, 4),
         (lambda file: file.tree.pop("scenes"), 4),
+        (lambda file: file.tree["nodes"][0].update(translation=[4.5e6, 1.2e6, 3e6], scale=[0.3, 0.3, 0.3]), 0.36),
         (lambda file: file.tree["meshes"][0]["primitives"][0].update(mode=1), 0),
     ],
 )
