@@ -45,6 +45,7 @@ _COUNTS = {  # texts of numbers, and how many
     ("mesh", "scale"): (1, 3),
 }
 _VERSION = re.compile(rb"\A((?:\xef\xbb\xbf)?<\?xml\s+version\s*=\s*[\"'])[\d.]+")  # simulators write 0.0, and read any
+_UNDECLARED = re.compile(r"Namespace prefix (\S+) (?:for|on) ")
 _XACRO = "it is written in xacro; make a plain URDF of it first: xacro FILE > robot.urdf"
 
 
@@ -122,7 +123,7 @@ def _parse(path: Path, notes: Counter) -> Any:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     try:
-        tree = etree.parse(BytesIO(text), etree.XMLParser(resolve_entities=False, no_network=True))
+        tree = _xml_tree(text)
         _make_plain(path, tree)
         turned = [origin for origin in tree.iter("origin") if _turns_over(origin.get("rpy", ""))]
         notes.update({_DEGREES: len(turned)} if turned else {})
@@ -143,6 +144,22 @@ def _parse(path: Path, notes: Counter) -> Any:
         raise DataError(f"{path}: not well-formed XML ({problem}); expected a URDF{hint}") from None
     except Exception as error:  # an element or attribute that is absent or odd: one bad file must not end the others
         raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
+
+
+def _xml_tree(text: bytes) -> Any:
+    """Returns the tree of lxml; prefixes that the file doesn't declare, as of Drake, are no fault."""
+    from lxml import etree
+
+    known = {"xacro"}
+    while True:
+        try:
+            return etree.parse(BytesIO(text), etree.XMLParser(resolve_entities=False, no_network=True))
+        except etree.XMLSyntaxError as error:
+            found = _UNDECLARED.match(error.msg or "")
+            if found is None or found[1] in known:
+                raise
+            known.add(found[1])
+            text = re.sub(rb"<robot(?=[\s>])", f'<robot xmlns:{found[1]}="{found[1]}"'.encode(), text, count=1)
 
 
 def _make_plain(path: Path, tree: Any) -> None:
@@ -197,6 +214,11 @@ def _remove_unread(root: Any) -> None:
                 inner.tag not in _READ[element.tag] or drawn and inner.tag == "collision"
             ):
                 element.remove(inner)
+    for geometry in root.iter("geometry"):  # some put a material into it
+        inside = [element for element in geometry if isinstance(element.tag, str)]
+        if any(element.tag in _SHAPES for element in inside):
+            for unread in (element for element in inside if element.tag not in _SHAPES):
+                geometry.remove(unread)
     for still in root.iterfind("joint[@type='fixed']"):
         for unread in [*still.findall("axis"), *still.findall("limit")]:
             still.remove(unread)

@@ -126,14 +126,18 @@ def _middle_far_away(positions: list[np.ndarray]) -> np.ndarray | None:
 
 
 def shape_at_rest(file: Gltf) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices f32 (V,3) and triangles i64 (T,3) of the scene as it stands, without what shows them: no texture is read."""
+    """Returns vertices f64 (V,3) and triangles i64 (T,3) of the scene as it stands, without what shows them: no texture is read."""
     parent, time = node_parents(file), np.zeros(1)
     poses, shown = node_poses(file, parent, _STILL, time), node_visibility(file, parent, _STILL, time)
     pieces = _visible_pieces(file, poses, shown)
     starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
-    moved = [_move(file, piece, _STILL, time, poses)[0][0] for piece in pieces]
+    moved = [_move(file, piece, _STILL, time, poses)[0] for piece in pieces]
+    shift = _middle_far_away(moved) if moved else None
+    if shift is not None:
+        poses[..., :3, 3] -= shift
+        moved = [_move(file, piece, _STILL, time, poses)[0] + shift for piece in pieces]
     triangles = [piece.triangles + start for piece, start in zip(pieces, starts)]
-    return np.concatenate([np.zeros((0, 3), np.float32), *moved]), np.concatenate(
+    return np.concatenate([np.zeros((0, 3)), *(positions[0] for positions in moved)]), np.concatenate(
         [np.zeros((0, 3), np.int64), *triangles]
     )
 
@@ -414,7 +418,7 @@ def _repaired(
         local, weights = local.copy(), weights.copy()
         local[lost], weights[lost] = local[near], weights[near]
     weights = weights / weights.sum(1, keepdims=True)
-    return np.where(weights > 0, local, 0), weights
+    return np.where(weights != 0, local, 0), weights
 
 
 def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

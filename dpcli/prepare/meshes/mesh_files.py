@@ -39,8 +39,9 @@ _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
 _LOST = re.compile(  # what pycollada says where a mesh, or how it is turned, is missing, not a lamp or a picture
-    r"(Geometry|Material|Node) \S+ not found|skew|transform|node requires|(geometry|node) instance|id in material"
+    r"(Geometry|Node) \S+ not found|skew|transform|node requires|(geometry|node) instance"
 )
+_COLORED = re.compile(rb"<((?:\w+:)?bind_material)\b[^>]*?(?:/>|>.*?</\1>)", re.DOTALL)  # no shape depends on it
 _SOLID = rb"(?i)\s*solid"
 _SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
@@ -122,13 +123,14 @@ def _read_dae(path: Path, root: Path | None) -> Any:
     from collada.common import DaeError
 
     _check_collada(path)
+    data = _COLORED.sub(b"", path.read_bytes())
     try:
-        return _by_trimesh(path, root, ignore_broken=False)
+        return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="dae", ignore_broken=False)
     except (DaeError, RuntimeError):  # perhaps of a lamp or a picture alone; the second where it raises nothing again
-        lost = [one.msg for one in Collada(str(path), ignore=[DaeError]).errors if _LOST.search(one.msg)]
+        lost = [one.msg for one in Collada(BytesIO(data), ignore=[DaeError]).errors if _LOST.search(one.msg)]
     if lost:
         raise DataError(f"{path}: a part of it would be left out ({lost[0]:.100}); repair it, or export it again")
-    return _by_trimesh(path, root)
+    return _by_trimesh(path, root, file_obj=BytesIO(data), file_type="dae")
 
 
 def _files_inside(path: Path, root: Path | None) -> Any:
@@ -200,6 +202,10 @@ def _check_collada(path: Path) -> None:
         raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
     if re.search(rb"<(\w+:)?ph\b", data):
         raise DataError(f"{path}: it has polygons with holes, which are not read; export it as triangles")
+    if name := _spread_positions(data):
+        raise DataError(
+            f"{path}: the positions of {name!r} lie between other numbers, which is not read; export it again"
+        )
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return
@@ -217,6 +223,23 @@ def _check_collada(path: Path) -> None:
         corners = np.split(np.asarray(one.vertex_index), np.cumsum(one.vcounts)[:-1])
         if not all(_are_convex(one.vertex[group]).all() for group in _by_size(corners).values()):
             raise DataError(f"{path}: some of its polygons aren't convex; export it again as triangles")
+
+
+def _spread_positions(data: bytes) -> str:
+    """Returns the id of a source of positions in a COLLADA file that are not every three numbers of its array in turn, as the
+    reader takes them; else nothing.
+    """
+    from lxml import etree
+
+    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    for mesh in root.iterfind(".//{*}mesh"):  # exporters give one id to sources of several
+        named = {one.get("source") for one in mesh.iterfind("{*}vertices/{*}input[@semantic='POSITION']")}
+        for source in mesh.iterfind("{*}source"):
+            accessor = source.find("{*}technique_common/{*}accessor")
+            given = ("0", "3") if accessor is None else (accessor.get("offset", "0"), accessor.get("stride", "3"))
+            if f"#{source.get('id')}" in named and tuple(map(str.strip, given)) != ("0", "3"):
+                return str(source.get("id"))
+    return ""
 
 
 def _mesh_of(polygons: Polygons) -> Any:

@@ -456,9 +456,11 @@ ODD = {
     "link": '<inertial><mass value="1.0 kg"/><inertia ixx="a"/></inertial><contact><lateral_friction value=""/></contact>'
     '<collision><geometry><box size="x"/></geometry></collision>',
     "visual": '<material name="$(arg color)"><color rgba="red"/></material>',
+    "geometry": '<material name="grey"/><drake:declare_convex/>',
     "joint": '<dynamics damping="" friction="a"/><safety_controller soft_lower_limit="x"/><calibration rising="x"/>',
-    "limit": 'effort="unlimited" ',
-    "robot": '<transmission><joint/></transmission><gazebo><plugin filename="$(find x)"/></gazebo><sensor type="q"/>'
+    "limit": 'effort="unlimited" drake:acceleration="40" ',
+    "robot": '<drake:collision_filter_group name="g"/>'
+    '<transmission><joint/></transmission><gazebo><plugin filename="$(find x)"/></gazebo><sensor type="q"/>'
     '<material name="q"><color rgba="1,0,0,1"/></material>',
 }
 

@@ -491,6 +491,18 @@ def test_lost_weights_follow_their_neighbors(tmp_path):
     np.testing.assert_allclose(load_animation(file.write(tmp_path / "lost.glb"), None, 3).positions, whole, atol=1e-6)
 
 
+def test_a_weight_below_zero_is_that_of_its_own_bone(tmp_path):
+    """Some exporters leave a little of it behind their smoothing; the weights still sum to 1."""
+    still, file = arm(), arm()
+    accessor = file.tree["accessors"][file.tree["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]]
+    start = file.tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    file.data[start : start + 16] = np.array([1.25, -0.25, 0, 0], "f4").tobytes()  # a vertex of the shoulder
+    by_shoulder, mixed = (load_animation(one.write(tmp_path / "arm.glb"), None, 3) for one in (still, file))
+    poses, rest = by_shoulder.bone_pose, by_shoulder.positions[0, 0] - [0, 5, 0]
+    by_elbow = np.einsum("tab,b->ta", poses[:, 2, :3, :3], rest - [1, 0, 0]) + poses[:, 2, :3, 3]
+    np.testing.assert_allclose(mixed.positions[:, 0], 1.25 * by_shoulder.positions[:, 0] - 0.25 * by_elbow, atol=1e-5)
+
+
 def test_objects_without_extent_or_numbers_are_refused():
     point = square_mesh((1, 1, 1)).moved(np.eye(3), np.zeros(3), 0.0)
     with pytest.raises(DataError, match="one point"):

@@ -103,9 +103,15 @@ LAMP = '<node id="lamp"><instance_light url="#gone"/></node>'
     [
         ("</visual_scene>", f"{LAMP}</visual_scene>", ""),
         ("</visual_scene>", '<node id="n"><instance_geometry url="#gone"/></node></visual_scene>', "Geometry #gone"),
-        ('target="#', 'target="#gone', "Material #gone"),
+        ('target="#', 'target="#gone', ""),  # a color
         ("<triangles", "<linestrips/><triangles", "Geometry #"),
         ("<triangles", "<polygons><ph/></polygons><triangles", "polygons with holes"),
+        (
+            'count="8" source="#verts-array-array" stride="3"',
+            'count="6" source="#verts-array-array" stride="4"',
+            "positions of",
+        ),
+        ('count="8" source="#verts', 'count="7" offset="3" source="#verts', "positions of 'verts-array' lie between"),
         ("<instance_geometry", "<skew>45 0 1 0 1 0 0</skew><instance_geometry", "skew"),
         ("<instance_geometry", "<translate>1 two 3</translate><instance_geometry", "translate"),
     ],
@@ -192,6 +198,7 @@ def lost_picture(file: GlbFile) -> None:
         (hidden, 4),
         (lost_picture, 4),
         (lambda file: file.tree.pop("scenes"), 4),
+        (lambda file: file.tree["nodes"][0].update(translation=[4.5e6, 1.2e6, 3e6], scale=[0.3, 0.3, 0.3]), 0.36),
         (lambda file: file.tree["meshes"][0]["primitives"][0].update(mode=1), 0),
     ],
 )
