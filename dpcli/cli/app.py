@@ -211,6 +211,15 @@ def _checking_values(command: Any) -> Any:
     return command
 
 
+def _paths_in(value: Any) -> list[str]:
+    """Returns what may name files in an argument: of a text with commas its pieces, too."""
+    if isinstance(value, (list, tuple)):
+        return [path for one in value for path in _paths_in(one)]
+    if isinstance(value, str):
+        return [value, *value.split(",")]
+    return [str(value)] if isinstance(value, Path) else []
+
+
 def _keeping_inputs(command: Any) -> Any:
     """Makes the command, or all below it, refuse to write over its inputs, over what is no regular file, or without permission."""
     for below in getattr(command, "commands", {}).values():
@@ -225,17 +234,7 @@ def _keeping_inputs(command: Any) -> Any:
         from dpcli.runtime.whole_file import check_regular, check_writable
         from dpcli.store.pipes import check_output
 
-        inputs: list[str] = []
-        for name, value in values.items():
-            if name not in written:
-                for one in value if isinstance(value, (list, tuple)) else [value]:
-                    inputs += (
-                        [str(one), *one.split(",")]
-                        if isinstance(one, str)
-                        else [str(one)]
-                        if isinstance(one, Path)
-                        else []
-                    )
+        inputs = [path for name, value in values.items() if name not in written for path in _paths_in(value)]
         for name, option in written.items():
             if name != "output" and str(values.get(name)) == "-":
                 check_regular(Path("-"), option)
