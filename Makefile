@@ -73,7 +73,7 @@ demo: $(READY)
 	$(DPC) prepare synthetic articulated -o demo/objects.h5 --objects 11 --sequences-per-object 1 --force
 	$(DPC) segment predict demo/objects.h5 -o demo/parts.h5 --picture demo/parts.png --turntable demo/parts.gif --force
 	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5 --split all
-	$(DPC) prepare synthetic animal -o demo/animal.h5 --size 128 --frames 16 --yaw 90 --no-travel --force
+	$(DPC) prepare synthetic animal -o demo/animal.h5 --seed 10 --size 128 --frames 16 --yaw 90 --no-travel --force
 	$(DPC) generate4d fit demo/animal.h5 -o demo/scene.h5 --preset fast
 	$(DPC) generate4d render demo/scene.h5 -o demo/scene.mp4 --picture demo/scene.png --force
 	$(DPC) generate4d view demo/scene.h5 -o demo/scene.html --force

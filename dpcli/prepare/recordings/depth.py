@@ -72,9 +72,22 @@ def _cameras(recording: Recording, topic: str) -> list[Calibration]:
     nearest = [name for name in depth if depth[name] == max(depth.values())]
     if len(nearest) > 1:
         nearest = [name for name in nearest if _SAYS_DEPTH.search(name.rpartition("/")[2])]
-    messages = recording.messages(nearest[0]) if len(nearest) == 1 else ()
-    found = (calibration_of_message(recording.path, topic, message.content) for message in messages)
+    if len(nearest) != 1:
+        return []
+    lens = _lens(recording, nearest[0])
+    found = (calibration_of_message(recording.path, topic, one.content, lens) for one in recording.messages(nearest[0]))
     return [camera for camera in found if camera]
+
+
+def _lens(recording: Recording, info: str) -> str:
+    """Returns the model of the lens from the text that the SDK of RealSense writes above a camera_info, in which every model is
+    called plumb_bob; "" where there is none.
+    """
+    above = "/" + "/".join([*_folder(info)[:-1], "camera_info"])
+    if recording.topics.get(above, ("", 0))[0] != "std_msgs/msg/String":
+        return ""
+    said = next((str(message.content.data) for message in recording.messages(above)), "")
+    return next(iter(re.findall(r"model=([^;]+)", said)), "")
 
 
 def _folder(topic: str, info: str = "info") -> list[str]:

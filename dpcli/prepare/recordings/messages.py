@@ -1,4 +1,6 @@
-"""Decodes single ROS messages: points (PointCloud2, Livox's CustomMsg), depth (Image, CompressedImage) and a camera (CameraInfo)."""
+"""Decodes single messages: points (PointCloud2, Livox's CustomMsg), depth (Image, CompressedImage) and a camera (CameraInfo), of
+ROS or of Foxglove.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,14 @@ from dpcli.prepare.decode.calibration import lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
+from dpcli.prepare.recordings import foxglove
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, LivoxScan
 from dpcli.prepare.recordings.rvl import unpack_rvl
 
-CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_KINDS)
-IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo",)
+CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_KINDS, *foxglove.CLOUDS)
+COMPRESSED_KINDS = ("sensor_msgs/msg/CompressedImage", *foxglove.COMPRESSED)
+IMAGE_KINDS = ("sensor_msgs/msg/Image", *foxglove.IMAGES, *COMPRESSED_KINDS)
+CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo", *foxglove.CAMERAS)
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
 _PIXELS |= {"mono8": "u1", "z16": "u2"}
@@ -66,12 +70,17 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     cloud.unread += tuple(f"{name} (again)" if name in fields else name for name in others)
     beyond = (len(data) - row_step * height) // max(step, 1)
     cloud.dropped |= {BEYOND: beyond} if beyond else {}
+    motion = getattr(content, "pose", None)  # of Foxglove's clouds: to the frame in which they lie
+    if motion is not None:
+        with np.errstate(invalid="ignore", over="ignore"):  # of numbers that aren't finite, which are dropped
+            moved = cloud.points @ motion[:3, :3].T + motion[:3, 3]
+        cloud.points = np.where((cloud.points != 0).any(1, keepdims=True), moved, 0)  # at the origin nothing was seen
     return cloud
 
 
 def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:
     """Returns the depth of an Image or CompressedImage, (H,W) as stored. Raises DataError that names its encoding."""
-    if kind == IMAGE_KINDS[1]:
+    if kind in COMPRESSED_KINDS:
         return _compressed_depth(path, str(content.format), bytes(memoryview(content.data)))
     encoding = str(content.encoding).lower()
     if encoding not in _PIXELS:
@@ -117,9 +126,10 @@ def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
     return image
 
 
-def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration | None:
+def calibration_of_message(path: Path, topic: str, content: Any, lens_model: str = "") -> Calibration | None:
     """Returns the camera of a CameraInfo for the images of ``topic``; None when it says that it isn't calibrated.
 
+    lens_model: of its lens, "" for the one that it tells.
     For rectified images (``rect`` in the name of the topic) its projection P counts, else its K and lens.
     """
     # ROS 1 has them in capitals
@@ -132,7 +142,7 @@ def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration 
         return None
     roi = content.roi  # a cut-out of the picture that the numbers are for; none where its size is 0
     numbers[2:] = numbers[2] - roi.x_offset, numbers[3] - roi.y_offset
-    bent = () if rectified else lens_coefficients(path, str(content.distortion_model), lens)
+    bent = () if rectified else lens_coefficients(path, lens_model or str(content.distortion_model), lens)
     camera = LensIntrinsics(*numbers, bent) if bent else Intrinsics(*numbers)
     size = int(roi.width or content.width), int(roi.height or content.height)
     return Calibration(camera, *size, source=f"{path}: camera_info")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,9 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.recordings.foxglove import FOXGLOVE_KINDS, as_ros
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
+from dpcli.prepare.recordings.mcap import McapReader
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -24,7 +26,6 @@ _IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
 _UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE)
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
-_NO_SCHEMA = "__schemaless__"  # what rosbags calls the type of a channel whose schema the index lacks
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
 
 
@@ -96,10 +97,10 @@ class Recording:
     the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
     """
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    def __init__(self, path: Path, reader: Any, topics: Mapping[str, Any]) -> None:
         self.path, self._reader, self.read = path, reader, 0
         self.topics: dict[str, tuple[str, int]] = {
-            name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()
+            name: (info.msgtype or "several types", info.msgcount) for name, info in topics.items()
         }  # name -> (type, number of messages)
         self.unlisted = _unlisted(path) if path.is_dir() else []
 
@@ -125,11 +126,11 @@ class Recording:
     def _list(self, fitting: list[str], what: str) -> str:
         if fitting:
             return f"choose one that holds {what} with --topic: {first_names(fitting, _LISTED)}"
-        held = first_names([f"{name} ({kind})" for name, (kind, _) in self.topics.items()], _LISTED)
-        told = f"no topic holds {what}; it has {held or 'no messages'}"
+        told = [f"{name} ({kind}{'' if count else ', no messages'})" for name, (kind, count) in self.topics.items()]
+        held = first_names(told, _LISTED)
+        said = f"no topic holds {what}; it has {held or 'no messages'}"
         tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
-        in_doubt = tool and (not held or _NO_SCHEMA in held)
-        return f"{told}; if its index is not whole, {tool} makes it" if in_doubt else told
+        return f"{said}; if its index is not whole, {tool} makes it" if tool and not held else said
 
     def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
         """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
@@ -143,21 +144,41 @@ class Recording:
                 if found is None:
                     return
                 connection, logged, raw = found
-                content = self._content(raw, connection.msgtype) if self.read % stride == 0 else None
+                content = self._content(raw, connection) if self.read % stride == 0 else None
             self.read += 1
             if content is not None:
                 yield Message(content, connection.msgtype, logged)
 
-    def _content(self, raw: bytes, kind: str) -> Any:
-        if kind in LIVOX_KINDS:
-            return read_livox(raw, ros1=not self._reader.is2)
-        return self._reader.deserialize(raw, kind)
+    def _content(self, raw: bytes, connection: Any) -> Any:
+        kind = connection.msgtype
+        if isinstance(self._reader, McapReader):
+            content = self._reader.decode(connection, raw)
+        elif kind in LIVOX_KINDS:
+            content = read_livox(raw, ros1=not self._reader.is2)
+        else:
+            content = self._reader.deserialize(raw, kind)
+        return as_ros(content, kind) if kind in FOXGLOVE_KINDS else content
 
 
 def _unlisted(folder: Path) -> list[str]:
     text = (folder / _METADATA).read_text("utf-8", "replace")
     names = sorted(one.name for one in folder.iterdir() if one.name.lower().endswith(_IN_FOLDERS))
     return [name for name in names if not re.search(rf"(?<![\w.-]){re.escape(name.removesuffix('.zstd'))}", text)]
+
+
+def _packs_messages(folder: Path) -> bool:
+    """Returns whether a folder is a ROS 2 bag in which every message is packed by itself, as only its metadata.yaml says."""
+    text = (folder / _METADATA).read_text("utf-8", "replace") if is_recording(folder) else ""
+    return re.search(r"compression_mode:\W*message", text, re.IGNORECASE) is not None
+
+
+def _plain_mcap(folder: Path) -> list[Path]:
+    """Returns the files of a ROS 2 bag where all are MCAP and no message in them is packed by itself, else none."""
+    if not folder.is_dir() or _packs_messages(folder):
+        return []
+    unlisted = _unlisted(folder)
+    listed = [one for one in folder.iterdir() if one.name.lower().endswith(_IN_FOLDERS) and one.name not in unlisted]
+    return sorted(listed) if all(one.suffix == ".mcap" for one in listed) else []
 
 
 @contextmanager
@@ -175,10 +196,18 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
-            reader.open()
+            if called.suffix == ".mcap" and not called.is_dir():
+                reader: Any = McapReader([called])
+                topics = reader.topics
+            else:
+                reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
+                reader.open()
+                topics = reader.topics
+                if files := _plain_mcap(called):
+                    reader.close()
+                    reader = McapReader(files)
         try:
-            yield Recording(path, reader)
+            yield Recording(path, reader, topics)
         finally:
             reader.close()
 
@@ -204,7 +233,8 @@ def _damage_named(path: Path) -> Iterator[None]:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         tool = _REPAIR_TOOLS.get(path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
+        if not path.is_dir() and _packs_messages(path.parent):
+            hint = f"; as the {_METADATA} beside it says, its messages are packed: name the folder {path.parent}"
         raise DataError(
-            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2"
-            f" messages{hint}"
+            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file{hint}"
         ) from None

@@ -25,6 +25,7 @@ from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.cloud_series import left_out_below
 from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden
@@ -268,6 +269,7 @@ class ArraySequences(OwnScans):
         good = next((item for item in items if not item.problem), None)
         if good:
             lines[0] += self._how(good)
+        lines += left_out_below(self.raw, SUFFIXES)
         return lines + (self._table.unnamed(items) if self._table else [])
 
     def _how(self, item: Item) -> str:

@@ -30,7 +30,7 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 _LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
-    " .pcap .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
+    " .pcap .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
     " .jsonl .ndjson"
@@ -146,6 +146,16 @@ def _advice(suffixes: Iterable[str]) -> str:
 
 def _counted(foreign: Counter[str]) -> tuple[str, ...]:
     return tuple(counted(count, f"{suffix} file") for suffix, count in sorted(foreign.items()))
+
+
+def left_out_below(root: Path, read: tuple[str, ...]) -> list[str]:
+    """Returns a line for the log that counts the files of formats that aren't read below a folder, none where there are none.
+
+    read: suffixes of those formats that are read after all.
+    """
+    foreign = tuple(one for one in _FOREIGN if one not in read)
+    found = count_suffixes((name for _, _, files in walk_folders(root) for name in files), foreign)
+    return [f"left out: {', '.join(_counted(found))} ({_advice(found)})"] if found else []
 
 
 def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterator[tuple[Path, list[str], Counter[str]]]:

@@ -20,7 +20,7 @@ from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.tracked_points import identify, with_track
 
-_WANTED = "clouds (PointCloud2, or CustomMsg of Livox)"
+_WANTED = "clouds (PointCloud2, CustomMsg of Livox, PointCloud of Foxglove)"
 _LISTED = 8
 
 

@@ -28,7 +28,7 @@ from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
-from dpcli.prepare.scans.cloud_series import refuse_file
+from dpcli.prepare.scans.cloud_series import left_out_below, refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SILENT, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
@@ -191,6 +191,7 @@ class TableSequences(OwnScans):
             lines[0] += " (--keep-fields)" if unused and self.track != COLUMNS else ""
         pieces = [name for name in self._paths if _PIECE.fullmatch(name)]
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
+        lines += left_out_below(self.raw, TABLES)
         return lines + (self._table.unnamed(items) if self._table else [])
 
 

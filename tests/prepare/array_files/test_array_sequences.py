@@ -323,3 +323,12 @@ def test_damage_is_told_with_the_file(tmp_path, form):
                 assert item.problem or reader.read(item, rng)
             except DataError:
                 pass
+
+
+def test_recordings_beside_arrays_are_told_as_left_out(tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(4, 20, 3)))
+    for name in ("b.mcap", "c.db3", "times.txt"):
+        (tmp_path / name).write_bytes(b"")
+    reader = ArraySequences(tmp_path)
+    told = "left out: 1 .db3 file, 1 .mcap file (name the recordings themselves)"
+    assert reader.summary(reader.items())[-1] == told

@@ -248,7 +248,8 @@ def test_a_topic_is_chosen_or_the_topics_are_listed(tmp_path):
     path = write_recording(tmp_path / "run", "bag", make, [*content, ("/image", START, make.image(depth16()))])
     assert read(RecordedClouds(path, topic="rear")).sequence.num_frames == 1
     with pytest.raises(
-        DataError, match="choose one that holds clouds .PointCloud2, or CustomMsg of Livox. with --topic: /front, /rear"
+        DataError,
+        match="choose one that holds clouds .PointCloud2, CustomMsg of Livox, PointCloud of Foxglove. with --topic: /front, /rear",
     ):
         read(RecordedClouds(path))
     with pytest.raises(DataError, match="no topic /top; choose one"):

@@ -361,3 +361,12 @@ def test_columns_that_folders_of_a_divided_table_name(tmp_path, option):
     path.write_text("frame,x,y,z\n0,1,2,3\n1,1,2,4\n")
     (item,) = TableSequences(tmp_path, **{option: "take"}).items()
     assert "no such column" in item.problem and "Its folder take=a tells it: join the pieces" in item.problem
+
+
+def test_recordings_and_packed_files_beside_tables_are_told_as_left_out(tmp_path):
+    write(tmp_path / "raw" / "log.csv", frames(3, 4, 7))
+    for name in ("a.bag", "b.mcap", "c.mcap", "d.csv.gz", "readme.md"):
+        (tmp_path / "raw" / name).write_bytes(b"")
+    reader = TableSequences(tmp_path / "raw")
+    told = "left out: 1 .bag file, 1 .gz file, 2 .mcap files (name the recordings themselves, or unpack them)"
+    assert reader.summary(reader.items())[-1] == told

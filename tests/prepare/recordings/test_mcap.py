@@ -1,0 +1,264 @@
+"""MCAP files of ROS 1, ROS 2 and Foxglove: every message arrives as it was written, however the file is laid out."""
+
+from __future__ import annotations
+
+import base64
+import json
+from functools import cache
+from itertools import combinations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
+from dpcli.prepare.recordings.depth import read_recorded_depth
+from dpcli.prepare.scans.recorded_clouds import RecordedClouds
+from tests.support.mcap_helpers import Layout, cloud, mcap, protobuf
+from tests.support.recording_helpers import START, Messages, write_recording
+
+pytest.importorskip("rosbags")
+RNG = np.random.default_rng(0)
+XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+LOOSE = np.dtype({"names": ["ring", "z", "x", "y"], "formats": ["u1", "<f4", "<f4", "<f4"], "offsets": [0, 2, 7, 11]})
+FOXGLOVE = "foxglove.PointCloud"
+PARTS = ("schemas", "channels", "statistics", "index")
+SUMMARIES = [some for count in range(len(PARTS) + 1) for some in combinations(PARTS, count)]
+LAYOUTS = st.builds(
+    Layout,
+    chunk=st.integers(0, 3),
+    packing=st.sampled_from(["", "lz4", "zstd"]),
+    summary=st.sampled_from(SUMMARIES),
+    profile=st.sampled_from(["", "ros1", "ros2"]),
+)
+
+
+def frames_of(count: int, kind: np.dtype = XYZ, seed: int = 0) -> list[np.ndarray]:
+    frames = [np.zeros(3 + t, kind) for t in range(count)]
+    for t, frame in enumerate(frames):
+        for k, name in enumerate(kind.names):
+            frame[name] = np.random.default_rng([seed, t, k]).uniform(1, 100, len(frame))
+    return frames
+
+
+def xyz(frame: np.ndarray) -> np.ndarray:
+    return np.stack([frame[name] for name in "xyz"], axis=1)
+
+
+@cache
+def messages_of(ros1: bool) -> Messages:
+    return Messages("bag" if ros1 else "mcap")
+
+
+def ros_cloud(frame: np.ndarray, stamp: int, ros1: bool) -> bytes:
+    make = messages_of(ros1)
+    pack = make.store.serialize_ros1 if ros1 else make.store.serialize_cdr
+    return bytes(pack(make.cloud(frame, stamp), "sensor_msgs/msg/PointCloud2"))
+
+
+def ros_channel(ros1: bool) -> tuple[str, str, str, str, str]:
+    make = messages_of(ros1)
+    described, _ = make.store.generate_msgdef("sensor_msgs/msg/PointCloud2", ros_version=1 if ros1 else 2)
+    name = "sensor_msgs/PointCloud2" if ros1 else "sensor_msgs/msg/PointCloud2"
+    return ("/points", "ros1" if ros1 else "cdr", name, "ros1msg" if ros1 else "ros2msg", described)
+
+
+def idl_of_a_cloud() -> str:
+    """A PointCloud2 and what it uses as IDL, as ROS 2 describes types that were defined so."""
+    parts = {
+        "sensor_msgs/msg/PointCloud2": "std_msgs::msg::Header header; unsigned long height; unsigned long width;"
+        " sequence<sensor_msgs::msg::PointField> fields; boolean is_bigendian; unsigned long point_step;"
+        " unsigned long row_step; sequence<uint8> data; boolean is_dense;",
+        "sensor_msgs/msg/PointField": "string name; unsigned long offset; uint8 datatype; unsigned long count;",
+        "std_msgs/msg/Header": "builtin_interfaces::msg::Time stamp; string frame_id;",
+        "builtin_interfaces/msg/Time": "int32 sec; uint32 nanosec;",
+    }
+    described = ""
+    for name, fields in parts.items():
+        package, _, last = name.split("/")
+        described += (
+            f"{'=' * 80}\nIDL: {name}\nmodule {package} {{ module msg {{ struct {last} {{ {fields} }}; }}; }};\n"
+        )
+    return described
+
+
+def read(path, **options):
+    reader = RecordedClouds(path, **options)
+    return reader.read(reader.items()[0], RNG)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    encoding=st.sampled_from(["ros1", "cdr", "idl", "protobuf", "json"]),
+    layout=LAYOUTS,
+    order=st.permutations(range(5)),
+    other=st.booleans(),
+)
+def test_every_layout_and_encoding_holds_what_was_written(tmp_path, encoding, layout, order, other):
+    kind = LOOSE if encoding in ("protobuf", "json") else XYZ
+    frames, stamps = frames_of(5, kind), [START + 10**8 * t + t**2 for t in range(5)]
+    if kind is XYZ:
+        channels = [ros_channel(encoding == "ros1")]
+        channels = [(*channels[0][:3], "ros2idl", idl_of_a_cloud())] if encoding == "idl" else channels
+        raw = [ros_cloud(frame, stamp, encoding == "ros1") for frame, stamp in zip(frames, stamps)]
+    else:
+        channels = [("/points", encoding, FOXGLOVE, "", "")]
+        raw = [cloud(frame, stamp, encoding) for frame, stamp in zip(frames, stamps)]
+    messages = [(0, stamps[t] + 5, raw[t]) for t in order]
+    if other:
+        channels.append(("/notes", "json", "Note", "jsonschema", "{}"))
+        messages = [one for message in messages for one in (message, (1, message[1], b"{}"))]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap(channels, messages, layout))
+    sample = read(path, keep=() if kind is XYZ else ("ring",))
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [3, 4, 5, 6, 7]
+    np.testing.assert_array_equal(sample.sequence.time, (np.array(stamps) - START) * 1e-9)
+    assert not sample.notes
+    if kind is LOOSE:
+        np.testing.assert_array_equal(
+            sample.sequence.extra["field_ring"], np.concatenate([f["ring"] for f in frames]).astype(np.float32)
+        )
+
+
+def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path):
+    topic, *kind, described = ros_channel(False)
+    header = described[: described.index("=" * 80)]
+    (frame,) = frames_of(1)
+    path = tmp_path / "run.mcap"
+    channels = [(topic, *kind, header), ("/other", *kind, described), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
+    path.write_bytes(mcap(channels, [(0, START, ros_cloud(frame, START, False))]))
+    np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_poses_of_clouds_move_their_points_and_returns_that_met_nothing_are_dropped(tmp_path, encoding):
+    frames = frames_of(2)
+    frames[1][1:] = 0
+    turn = [0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]  # a quarter about z
+    raw = [
+        cloud(frame, START + t * 10**8, encoding, ([1.0 + t, 2.0, 3.0], [2 * q for q in turn]))
+        for t, frame in enumerate(frames)
+    ]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap([("/points", encoding, FOXGLOVE, "", "")], [(0, START, one) for one in raw]))
+    sample = read(path)
+    points = [np.stack([1.0 + t - frame["y"], 2 + frame["x"], 3 + frame["z"]], 1) for t, frame in enumerate(frames)]
+    np.testing.assert_allclose(sample.sequence.points, np.concatenate([points[0], points[1][:1]]), rtol=1e-6)
+    assert sample.notes == {AT_ORIGIN: 3}
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+@pytest.mark.parametrize("form", ["16UC1", "32FC1", "png"])
+def test_depth_of_foxglove_with_its_camera(tmp_path, encoding, form):
+    depth = RNG.integers(500, 3000, (12, 16)).astype("<u2")
+    depth = depth.astype("<f4") / 1000 if form == "32FC1" else depth
+    data = cv2.imencode(".png", depth)[1].tobytes() if form == "png" else depth.tobytes()
+    numbers = [500.0, 0.0, 8.0, 0.0, 510.0, 6.0, 0.0, 0.0, 1.0]
+    if encoding == "json":
+        said = {"data": base64.b64encode(data).decode(), "frame_id": "eye"}
+        more = {"width": 16, "height": 12, "encoding": form, "step": 16 * depth.itemsize}
+        image = json.dumps(said | ({"format": form} if form == "png" else more)).encode()
+        infos = [json.dumps({"width": 16, "height": 12, "K": k}).encode() for k in ([], numbers)]
+    else:
+        more = [(2, np.uint32(16)), (3, np.uint32(12)), (4, form), (5, np.uint32(16 * depth.itemsize)), (6, data)]
+        image = protobuf((2, data), (3, form)) if form == "png" else protobuf(*more)
+        infos = [protobuf((2, np.uint32(16)), (3, np.uint32(12)), *k) for k in ([], [(6, numbers)])]
+    name = "foxglove.CompressedImage" if form == "png" else "foxglove.RawImage"
+    channels = [
+        ("/eye/depth/image", encoding, name, "", ""),
+        ("/eye/depth/calibration", encoding, "foxglove.CameraCalibration", "", ""),
+    ]
+    messages = [(1, START, infos[0]), (1, START, infos[1]), (0, START, image), (0, START + 10**8, image)]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap(channels, messages))
+    frames, described, _ = read_recorded_depth(path)
+    for frame in frames.frames:
+        np.testing.assert_array_equal(frame, depth)
+    np.testing.assert_allclose(frames.time, [0, 0.1])
+    camera = described.of_pictures(16, 12)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500, 510, 8, 6)
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_foxglove_messages_that_were_cut_are_named(tmp_path, encoding):
+    whole = cloud(frames_of(1)[0], START, encoding)
+    said = "not a readable recording|has fewer|is damaged|bytes"
+    for kept in range(1, len(whole), 7):
+        path = tmp_path / f"{kept}.mcap"
+        path.write_bytes(mcap([("/points", encoding, FOXGLOVE, "", "")], [(0, START, whole[:kept])]))
+        with pytest.raises(DataError, match=said):
+            read(path)
+
+
+def test_a_point_of_foxglove_that_was_cut_is_named(tmp_path):
+    frame = frames_of(1)[0]
+    raw = cloud(frame, START, "protobuf").removesuffix(frame.tobytes())
+    raw = raw[:-1] + bytes([raw[-1] - 2]) + frame.tobytes()[:-2]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    with pytest.raises(DataError, match="a cloud of 3 x 1 points of 12 bytes, rows of 36, has 34 bytes"):
+        read(path)
+
+
+def test_encodings_that_are_not_read_are_named(tmp_path):
+    path = tmp_path / "run.mcap"
+    channels = [("/points", "flatbuffer", FOXGLOVE, "flatbuffer", ""), ("/scan", "json", "foxglove.LaserScan", "", "")]
+    channels.append(("/empty", "json", FOXGLOVE, "", ""))
+    path.write_bytes(mcap(channels, [(0, START, b"abc"), (1, START, b"{}")]))
+    said = (
+        r"it has /points \(foxglove.PointCloud in flatbuffer\), /scan .*, /empty \(foxglove.PointCloud, no messages\)"
+    )
+    with pytest.raises(DataError, match=said):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"), [("cut", "cut off at byte"), ("flipped", "a chunk is damaged"), ("other", "packed by zip")]
+)
+def test_damaged_files_are_named(tmp_path, damage, said):
+    raw = cloud(frames_of(1)[0], START, "protobuf")
+    packing = "zip" if damage == "other" else ""
+    data = mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)], Layout(packing=packing))
+    if damage == "cut":
+        data = data[: len(data) * 2 // 3]
+    elif damage == "flipped":
+        at = data.index(raw) + len(raw) - 5
+        data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=f"not a readable recording .*{said}.*mcap recover"):
+        read(path)
+
+
+@pytest.mark.parametrize("chunk", [0, 2])
+@pytest.mark.parametrize("summary", [(), ("channels", "statistics", "index"), ("schemas", "channels", "statistics")])
+def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_path, chunk, summary):
+    frames, stamps = frames_of(6), [START + 10**8 * t for t in range(6)]
+    make = messages_of(False)
+    content = [("/points", stamp, make.cloud(frame, stamp)) for frame, stamp in zip(frames, stamps)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    for part, places in enumerate(([2, 0, 1], [5, 4, 3])):
+        messages = [(0, stamps[t], ros_cloud(frames[t], stamps[t], False)) for t in places]
+        data = mcap([ros_channel(False)], messages, Layout(chunk, summary=summary, profile="ros2"))
+        (bag / f"run_{part}.mcap").write_bytes(data)
+    (bag / "run.mcap").unlink()
+    told = (bag / "metadata.yaml").read_text()
+    files = "  relative_file_paths:\n  - run_0.mcap\n  - run_1.mcap\n"
+    (bag / "metadata.yaml").write_text(told.replace("  relative_file_paths:\n  - run.mcap\n", files))
+    sample = read(bag)
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
+    np.testing.assert_allclose(sample.sequence.time, np.arange(6) / 10)
+    assert not sample.notes
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+def test_files_whose_messages_are_packed_name_the_folder_that_says_so(tmp_path, kind):
+    make = messages_of(False)
+    bag = write_recording(tmp_path / "run", kind, make, [("/points", START, make.cloud(frames_of(1)[0]))], "MESSAGE")
+    (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
+    with pytest.raises(DataError, match=f"its messages are packed: name the folder {bag}$"):
+        read(file)
