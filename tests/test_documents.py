@@ -242,8 +242,10 @@ def test_the_tree_shows_the_folders_that_there_are():
 
 
 def where_is() -> dict[str, tuple[list[str], list[str]]]:
-    """The table of terms: the files of each, and the names to begin at."""
-    rows = re.findall(r"^\| (.*?) \| (.*`.*) \| (.*)\|$", ARCHITECTURE.read_text(), re.MULTILINE)
+    """The tables of terms, the thesis's among them: the files of each, and the names to begin at."""
+    of_the_thesis = (ROOT / "docs" / "glossary.md").read_text().partition("\n## Words of the thesis")[2]
+    tables = ARCHITECTURE.read_text() + of_the_thesis
+    rows = re.findall(r"^\| (.*?) \| (.*`.*) \| (.*)\|$", tables, re.MULTILINE)
     cells = {term: tuple(re.findall(r"`([^`]+)`", cell) for cell in rest) for term, *rest in rows}
     return {term: both for term, both in cells.items() if any("/" in file for file in both[0])}
 

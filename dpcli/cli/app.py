@@ -125,45 +125,43 @@ def _global_flags(argv: list[str]) -> list[str]:
 def _explain(error: BaseException) -> int:
     """Prints a message for a person and returns the exit code."""
     from dpcli.runtime.progress import log
-    from dpcli.runtime.whole_file import disk_full
 
     if isinstance(error, BrokenPipeError):
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # the interpreter flushes stdout once more at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes it once more at exit
         return CLOSED_PIPE
     if isinstance(error, KeyboardInterrupt) or type(error).__name__ == "Abort":
         return INTERRUPTED  # `main` says so, whatever way it learns of it
     if hasattr(error, "show") and hasattr(error, "exit_code"):  # wrong use, found by the option parser
         error.show(file=sys.stderr)
         return error.exit_code
+    code, sentence = _what_went_wrong(error)
+    if sentence is None:
+        raise error
+    log.error(sentence)
+    return code
+
+
+def _what_went_wrong(error: BaseException) -> tuple[int, str | None]:
+    """Returns the exit code and a sentence; None for a fault of this program."""
+    from dpcli.runtime.whole_file import disk_full
+
     if isinstance(error, DpcError):
-        log.error(str(error))
-        return error.exit_code
-    if isinstance(error, FileNotFoundError) and error.filename is None and _current_folder_is_gone():
-        log.error("the current folder was removed; change to one that exists (cd), then run the same command again")
-        return DataError.exit_code
-    if isinstance(error, FileNotFoundError) and error.filename is not None:
-        log.error(f"{error.filename}: no such file or folder")
-        return DataError.exit_code
-    if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
-        log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
-        return DataError.exit_code
-    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-        log.error("too many open files; allow more (ulimit -n 1024), or use fewer --jobs")
-        return 1
+        return error.exit_code, str(error)
     named = error.filename if isinstance(error, OSError) else None
+    if isinstance(error, FileNotFoundError) and named is None and _current_folder_is_gone():
+        gone = "the current folder was removed; change to one that exists (cd), then run the same command again"
+        return DataError.exit_code, gone
+    if isinstance(error, FileNotFoundError) and named is not None:
+        return DataError.exit_code, f"{named}: no such file or folder"
+    said = f"{named}: {error.strerror[0].lower()}{error.strerror[1:]}" if named is not None and error.strerror else None
+    if isinstance(error, OSError) and error.errno in _PLACES and named:
+        return DataError.exit_code, said
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        return 1, "too many open files; allow more (ulimit -n 1024), or use fewer --jobs"
     full = disk_full(named or "the output", error, place=named) if isinstance(error, OSError) else None
     if full is not None:
-        log.error(str(full))
-        return full.exit_code
-    if out_of_memory(error):
-        log.error(memory_sentence(error))
-        return 1
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
-        return 1
-    raise error
+        return full.exit_code, str(full)
+    return 1, memory_sentence(error) if out_of_memory(error) else said
 
 
 def _current_folder_is_gone() -> bool:
@@ -213,6 +211,15 @@ def _checking_values(command: Any) -> Any:
     return command
 
 
+def _paths_in(value: Any) -> list[str]:
+    """Returns what may name files in an argument: of a text with commas its pieces, too."""
+    if isinstance(value, (list, tuple)):
+        return [path for one in value for path in _paths_in(one)]
+    if isinstance(value, str):
+        return [value, *value.split(",")]
+    return [str(value)] if isinstance(value, Path) else []
+
+
 def _keeping_inputs(command: Any) -> Any:
     """Makes the command, or all below it, refuse to write over its inputs, over what is no regular file, or without permission."""
     for below in getattr(command, "commands", {}).values():
@@ -227,17 +234,7 @@ def _keeping_inputs(command: Any) -> Any:
         from dpcli.runtime.whole_file import check_regular, check_writable
         from dpcli.store.pipes import check_output
 
-        inputs: list[str] = []
-        for name, value in values.items():
-            if name not in written:
-                for one in value if isinstance(value, (list, tuple)) else [value]:
-                    inputs += (
-                        [str(one), *one.split(",")]
-                        if isinstance(one, str)
-                        else [str(one)]
-                        if isinstance(one, Path)
-                        else []
-                    )
+        inputs = [path for name, value in values.items() if name not in written for path in _paths_in(value)]
         for name, option in written.items():
             if name != "output" and str(values.get(name)) == "-":
                 check_regular(Path("-"), option)

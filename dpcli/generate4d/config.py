@@ -166,37 +166,33 @@ class Supervision:
 
 
 CATALOG = Catalog(fit=FitConfig, supervision=Supervision)
+_QUICK = FitConfig(
+    dense_steps=600,
+    sparse_steps=2000,
+    batch=2,
+    gaussians=6000,
+    most_gaussians=12_000,
+    parts=16,
+    width=96,
+    depth=4,
+    rate_mean=(2e-3, 2e-4),
+    rate_network=(2e-3, 2e-4),
+    rate_rigid=2e-3,
+    rate_scale=0.01,
+    grow_share=0.15,
+)
 FIT_PRESETS = {
     "thesis": FitConfig(size=512, start="sphere", seeds=False),
-    "quick": FitConfig(
-        dense_steps=600,
-        sparse_steps=2000,
-        batch=2,
-        gaussians=6000,
-        most_gaussians=12_000,
-        parts=16,
-        width=96,
-        depth=4,
-        rate_mean=(2e-3, 2e-4),
-        rate_network=(2e-3, 2e-4),
-        rate_rigid=2e-3,
-        rate_scale=0.01,
-        grow_share=0.15,
-    ),
-    "fast": FitConfig(
+    "quick": _QUICK,
+    "fast": replace(
+        _QUICK,
         dense_steps=40,
         sparse_steps=460,
-        batch=2,
         gaussians=5000,
         most_gaussians=8000,
-        parts=16,
-        width=96,
-        depth=4,
         rate_mean=(2e-3, 5e-4),
         rate_network=(3e-3, 3e-4),
         rate_rigid=3e-3,
-        rate_scale=0.01,
-        grow_share=0.15,
     ),
     "tiny": FitConfig(
         size=48,

@@ -43,7 +43,7 @@ class StepResult:
 
 
 class SceneOptimizer:
-    """Fits a `Model4D` to pictures with Adam, first its dense stage, then the sparse one (thesis 5.4.3.3).
+    """Fits a `Model4D` to pictures with Adam, first its dense stage (eq. 5.7), then the sparse one (eq. 5.9).
 
     prior: judges random new views (eq. C.11); shape: shows every frame from new sides; None: none does. regularize: keeps
     one view's object from going flat (`thickness`, `aspect`).
@@ -64,7 +64,7 @@ class SceneOptimizer:
         self.prior, self.regularize, self.shape = prior, regularize, shape
         self.device = device or torch.device("cpu")
         self.step = 0
-        self.control_reference: Tensor | None = None  # [T, K, 3] p-bar of C.13
+        self.control_reference: Tensor | None = None  # [T, K, 3] p-bar of eq. C.13
         self._neighbors: Tensor | None = None
         self.times = targets.times().to(self.device)
 

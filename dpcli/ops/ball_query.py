@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -50,10 +51,8 @@ def space_time_ball_query(
     >>> found.tolist(), hits.tolist()
     ([[[0, 1, 0]]], [[2]])
     """
-    arguments = (*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
-    if chosen_backend(points.device) == "torch":
-        return _any_torch(*arguments)
-    return _balanced_numba(*arguments[:-1]) if order == "balanced" else _query_numba(*arguments)
+    query = _checked(points, times, centroids, centroid_times, radii, k, order)
+    return _any_torch(query) if chosen_backend(points.device) == "torch" else _query_numba(query)
 
 
 def balanced_shares(k: int, reach: int) -> list[int]:
@@ -77,7 +76,19 @@ def space_time_ball_query_reference(
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Computes `space_time_ball_query` in plain torch, as a reference: all pairs, in blocks of bounded memory."""
-    return _any_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
+    return _any_torch(_checked(points, times, centroids, centroid_times, radii, k, order))
+
+
+class _Query(NamedTuple):
+    """Holds checked arguments: frame indices i64, and in place of the radii their squares."""
+
+    points: torch.Tensor
+    times: torch.Tensor
+    centroids: torch.Tensor
+    centroid_times: torch.Tensor
+    limits: torch.Tensor
+    k: int
+    order: str
 
 
 def _checked(
@@ -88,7 +99,7 @@ def _checked(
     radii: torch.Tensor | Sequence[float],
     k: int,
     order: str,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> _Query:
     points, centroids = positions("points", points), positions("centroids", centroids)
     if points.shape[0] != centroids.shape[0] or points.shape[1] == 0:
         raise ValueError(f"points {tuple(points.shape)} and centroids {tuple(centroids.shape)} need one batch, N >= 1")
@@ -97,12 +108,9 @@ def _checked(
     limits = _squared_radii(radii, points.device, trim=order != "balanced")
     if order == "balanced" and k < 2 * len(limits) - 1:
         raise ValueError(f"k must be at least 1 per frame within reach, {2 * len(limits) - 1}, but is {k}")
-    return (
-        points,
-        _frame_indices("times", times, points),
-        centroids,
-        _frame_indices("centroid_times", centroid_times, centroids),
-        limits,
+    times = _frame_indices("times", times, points)
+    return _Query(
+        points, times, centroids, _frame_indices("centroid_times", centroid_times, centroids), limits, k, order
     )
 
 
@@ -127,78 +135,41 @@ def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device, 
     return (radii * radii).to(device)
 
 
-def _query_numba(
-    points: torch.Tensor,
-    times: torch.Tensor,
-    centroids: torch.Tensor,
-    centroid_times: torch.Tensor,
-    limits: torch.Tensor,
-    k: int,
-    order: str,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    from dpcli.ops.cpu.neighbor_search import ball_query_kernel
+def _query_numba(query: _Query) -> tuple[torch.Tensor, torch.Tensor]:
+    from dpcli.ops.cpu.neighbor_search import balanced_query_kernel, ball_query_kernel
 
-    batch, rows = centroid_times.shape
+    points, *rest, k, order = query
+    batch, rows = query.centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)
     count = torch.empty((batch, rows), dtype=torch.int64)
-    xyz = np.ascontiguousarray(points.numpy().transpose(0, 2, 1))  # by numpy: torch's copy would wake OpenMP threads
-    rest = (tensor.contiguous().numpy() for tensor in (times, centroids, centroid_times, limits))
-    arguments = (xyz, *rest, order == "nearest", index.numpy(), count.numpy())
-    run_in_threads(ball_query_kernel, arguments, batch * rows, _ROW_NS[order])
+    if order == "balanced":
+        kernel, xyz = balanced_query_kernel, points.contiguous().numpy()
+        choice = np.array(balanced_shares(k, len(query.limits) - 1), np.int64)
+    else:
+        kernel, choice = ball_query_kernel, order == "nearest"
+        xyz = np.ascontiguousarray(points.numpy().transpose(0, 2, 1))  # torch's copy would wake OpenMP threads
+    arrays = (tensor.contiguous().numpy() for tensor in rest)
+    run_in_threads(kernel, (xyz, *arrays, choice, index.numpy(), count.numpy()), batch * rows, _ROW_NS[order])
     return index, count
 
 
-def _balanced_numba(
-    points: torch.Tensor,
-    times: torch.Tensor,
-    centroids: torch.Tensor,
-    centroid_times: torch.Tensor,
-    limits: torch.Tensor,
-    k: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    from dpcli.ops.cpu.neighbor_search import balanced_query_kernel
-
-    batch, rows = centroid_times.shape
-    index = torch.empty((batch, rows, k), dtype=torch.int64)
-    count = torch.empty((batch, rows), dtype=torch.int64)
-    shares = np.array(balanced_shares(k, len(limits) - 1), np.int64)
-    arrays = (tensor.contiguous().numpy() for tensor in (points, times, centroids, centroid_times, limits))
-    arguments = (*arrays, shares, index.numpy(), count.numpy())
-    run_in_threads(balanced_query_kernel, arguments, batch * rows, _ROW_NS["balanced"])
-    return index, count
-
-
-def _any_torch(
-    points: torch.Tensor,
-    times: torch.Tensor,
-    centroids: torch.Tensor,
-    centroid_times: torch.Tensor,
-    limits: torch.Tensor,
-    k: int,
-    order: str,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    if order != "balanced":
-        return _query_torch(points, times, centroids, centroid_times, limits, k, order)
-    reach, shares = len(limits) - 1, balanced_shares(k, len(limits) - 1)
+def _any_torch(query: _Query) -> tuple[torch.Tensor, torch.Tensor]:
+    if query.order != "balanced":
+        return _query_torch(query)
+    k, limits, reach = query.k, query.limits, len(query.limits) - 1
     found = []
-    for offset, share in zip(range(-reach, reach + 1), shares, strict=True):
+    for offset, share in zip(range(-reach, reach + 1), balanced_shares(k, reach), strict=True):
         only = limits[abs(offset) : abs(offset) + 1]  # one radius: just the frame at this offset
-        found.append(_query_torch(points, times, centroids, centroid_times + offset, only, share, "first"))
+        at = query.centroid_times + offset
+        found.append(_query_torch(query._replace(centroid_times=at, limits=only, k=share, order="first")))
     own = found[reach][0]
     slots = torch.arange(k, device=own.device) % own.shape[-1]
     pieces = [torch.where(hits[..., None] > 0, idx, own[..., slots[: idx.shape[-1]]]) for idx, hits in found]
     return torch.cat(pieces, -1), sum(hits for _, hits in found)
 
 
-def _query_torch(
-    points: torch.Tensor,
-    times: torch.Tensor,
-    centroids: torch.Tensor,
-    centroid_times: torch.Tensor,
-    limits: torch.Tensor,
-    k: int,
-    order: str,
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _query_torch(query: _Query) -> tuple[torch.Tensor, torch.Tensor]:
+    points, times, centroids, centroid_times, limits, k, order = query
     batch, rows = centroid_times.shape
     total = points.shape[1]
     bounds = torch.cat([limits, limits.new_full((1,), -1.0)])  # last: too far in time

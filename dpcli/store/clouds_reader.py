@@ -180,11 +180,10 @@ class CloudsReader:
     def _read(self, index: int, frames: slice | Sequence[int] | None, fields: Sequence[str] | None) -> CloudSequence:
         first = int(self._sequence_offsets[index])
         count = int(self._sequence_offsets[index + 1]) - first
-        wanted = (
-            np.arange(count)[frames if frames is not None else slice(None)]
-            if not isinstance(frames, Sequence)
-            else np.asarray(frames)
-        )
+        if isinstance(frames, Sequence):
+            wanted = np.asarray(frames)
+        else:
+            wanted = np.arange(count)[slice(None) if frames is None else frames]
         if len(wanted) == 0 or wanted.min() < 0 or wanted.max() >= count:
             raise DataError(
                 f"{self.path}: frames {frames} of {self.names[index]!r}, which has {counted(count, 'frame')}"

@@ -3,43 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.results import Result
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.result_json import segmentation_json
-from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Keeping, made_by
+from dpcli.evaluate.segmentation.sequence_pass import made_by
 from dpcli.evaluate.segmentation.tables import segmentation_notes, segmentation_tables
 from dpcli.store import input_file
 
 
-def run_segmentation(
-    parts: str,
-    truth: Path | None,
-    *,
-    protocol: str,
-    ignore_below: int,
-    split: str | None,
-    intersect: bool,
-    resampling: Resampling,
-    picture: Path | None = None,
-    keeping: Keeping = NOT_KEPT,
-) -> Result:
+def run_segmentation(parts: str, truth: Path | None, *, picture: Path | None = None, **choices: Any) -> Result:
     """Returns the segmentation metrics of a parts file (`-`: from a pipe), or of kept statistics, and draws bars where `picture` is named.
 
-    The other arguments and errors are those of `evaluate_segmentation`.
+    The choices, and errors, are those of `evaluate_segmentation`.
     """
     with input_file(parts) as path:
-        report = evaluate_segmentation(
-            path,
-            truth,
-            protocol=protocol,
-            ignore_below=ignore_below,
-            split=split,
-            intersect=intersect,
-            resampling=resampling,
-            keeping=keeping,
-        )
+        report = evaluate_segmentation(path, truth, **choices)
         if picture is not None:
             from dpcli.evaluate.segmentation.class_bars import draw_segmentation_bars
 

@@ -95,23 +95,23 @@ def history_seed(provenance: Sequence[dict]) -> int | None:
 
 def metrics_of_values(
     source: str,
-    task: str,
-    kind: str,
     values: Mapping[str, Mapping[str, float]],
     units: Mapping[str, str],
     must_equal: Mapping[str, object] | None = None,
 ) -> FileMetrics:
-    """Returns the metrics of a table {sample name: {metric: value}}, which are means over the samples (pictures, views).
+    """Returns the metrics of a table {view: {metric: value}} of pictures, which are means over the views.
 
-    must_equal: as in `FileMetrics`. NaN = the sample doesn't count. Raises DataError without a sample, and naming those with an
+    must_equal: as in `FileMetrics`. NaN = the view doesn't count. Raises DataError without a view, and naming those with an
     infinite value.
     """
     names = list(values)
     if not names:
-        raise DataError(f"{source}: no {kind} to compare")
+        raise DataError(f"{source}: no views to compare")
     per_sample = {key: np.array([values[name].get(key, np.nan) for name in names], np.float64) for key in units}
     for key, column in per_sample.items():
         if np.isinf(column).any():
             bad = [names[row] for row in np.flatnonzero(np.isinf(column))]
-            raise DataError(f"{source}: {key} of {len(bad)} {kind} is infinite: {list_names(bad)}")
-    return FileMetrics(source, task, kind, names, means_of_samples(per_sample), per_sample, units, must_equal or {})
+            raise DataError(f"{source}: {key} of {len(bad)} views is infinite: {list_names(bad)}")
+    return FileMetrics(
+        source, "video", "views", names, means_of_samples(per_sample), per_sample, units, must_equal or {}
+    )

@@ -179,7 +179,7 @@ def _measure_video(path: Path, source: str, options: EvaluationOptions) -> FileM
         raise DataError(f"{source}: {name} not computed: {reason}")
     values, units = view_values(report)
     protocol = {"protocol": describe_protocol(report.protocol)}
-    found = metrics_of_values(source, "video", "views", values, units, protocol)
+    found = metrics_of_values(source, values, units, protocol)
     history, notes = report.history, report.notes
     return replace(found, left_out=report.left_out, seed=history_seed(history), provenance=history, notes=notes)
 

@@ -19,6 +19,7 @@ from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
 _SIDES = (60, 120, 180, -120, -60)  # degrees from the reference camera
+_COLUMNS, _SIDE = 5, 128  # times, and about how many pixels wide a picture is
 
 
 @dataclass
@@ -62,12 +63,10 @@ def _instants_of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
 
 
 @torch.no_grad()
-def write_preview(
-    fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128
-) -> None:
+def write_preview(fitted: Model4D | GaussianScene, targets: Targets, path: Path) -> None:
     """Writes a picture whose rows are input, render, parts, rigid weight, and views from _SIDES; columns: times."""
-    frames = spread_evenly(targets.num_frames, columns)
-    shrink = max(targets.size[1] // side, 1)
+    frames = spread_evenly(targets.num_frames, _COLUMNS)
+    shrink = max(targets.size[1] // _SIDE, 1)
     truth, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
     if isinstance(fitted, GaussianScene):
         instants = _instants_of_scene(fitted, frames)

@@ -21,7 +21,7 @@ class CanonicalGaussians(nn.Module):
 
     def __init__(self, mean: Tensor, color: Tensor, opacity: float = 0.5) -> None:
         super().__init__()
-        scale = mean_neighbor_distance(mean, 3).clamp(1e-4, 0.05)
+        scale = mean_neighbor_distance(mean).clamp(1e-4, 0.05)
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(mean), 1)
         self.mean = nn.Parameter(mean.clone())
         self.log_scale = nn.Parameter(scale.log()[:, None].repeat(1, 3))

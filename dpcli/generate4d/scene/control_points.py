@@ -19,7 +19,7 @@ class ControlPoints(nn.Module):
         super().__init__()
         self.neighbors = min(neighbors, len(positions))
         self.position = nn.Parameter(positions.detach().clone())
-        spacing = mean_neighbor_distance(positions, 3)
+        spacing = mean_neighbor_distance(positions)
         self.log_radius = nn.Parameter(spacing.clamp(min=1e-4).log())
 
     @classmethod
@@ -61,9 +61,9 @@ class ControlPoints(nn.Module):
         return moved, normalize_quaternion(turn)
 
 
-def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
-    """Returns the mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
-    count = min(count, len(points) - 1)
+def mean_neighbor_distance(points: Tensor) -> Tensor:  # [N, 3] -> [N]
+    """Returns the mean distance of each point to its 3 nearest others; 0.01 where there is no other."""
+    count = min(3, len(points) - 1)
     if count < 1:
         return torch.full((len(points),), 0.01).to(points)
     squared, _ = knn(points.detach()[None], points.detach()[None], count + 1)

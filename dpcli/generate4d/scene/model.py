@@ -1,4 +1,4 @@
-"""The whole 4D model: canonical Gaussians, the motion field, and from the sparse stage on the control points."""
+"""The whole 4D model (eq. 5.2): canonical Gaussians, the motion field, and from the sparse stage on the control points."""
 
 from __future__ import annotations
 

@@ -39,6 +39,8 @@ def rasterization(
     tile_size: int = 16,
     backgrounds: Tensor | None = None,  # [C, D]
     render_mode: str = "RGB",
+    *,
+    reference: bool = False,
 ) -> tuple[Tensor, Tensor, dict]:  # [C, H, W, D], [C, H, W, 1], notes
     """Renders colors, alphas and notes of C pinhole pictures of N Gaussians (Kerbl et al. 2023), with gradients.
 
@@ -51,8 +53,8 @@ def rasterization(
     gradient); a pixel stops before transmittance 1e-4. tile_size never changes a result, only the reference's speed.
     Notes: means2d (C,N,2) (after retain_grad() its gradient in pixels, for densification), conics (C,N,3), depths (C,N),
     radii (C,N,2) i32, 0 where unseen, opacities, width, height, n_cameras.
-    Gradients reach all tensors but Ks; float32 is fast, float64 always takes the reference. Raises ValueError on wrong
-    shapes, values that aren't finite, an unknown render_mode.
+    Gradients reach all tensors but Ks; float32 is fast, float64 and `reference` always take the torch reference. Raises
+    ValueError on wrong shapes, values that aren't finite, an unknown render_mode.
 
     >>> mean, size = torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 0.2)
     >>> lens = torch.tensor([[[8.0, 0.0, 4.5], [0.0, 8.0, 4.5], [0.0, 0.0, 1.0]]])
@@ -61,93 +63,23 @@ def rasterization(
     >>> colors.shape, round(alphas[0, 4, 4].item(), 3), alphas[0, 0, 0].item()  # the middle, and a corner it doesn't reach
     (torch.Size([1, 9, 9, 3]), 0.5, 0.0)
     """
-    return _render(
-        False,
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        (near_plane, far_plane, radius_clip, eps2d),
-        sh_degree,
-        tile_size,
-        backgrounds,
-        render_mode,
-    )
-
-
-def rasterization_reference(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
-    render_mode: str = "RGB",
-) -> tuple[Tensor, Tensor, dict]:
-    """Computes `rasterization` in plain torch, as a reference: same arguments, same result to rounding; any device, float64."""
-    return _render(
-        True,
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        (near_plane, far_plane, radius_clip, eps2d),
-        sh_degree,
-        tile_size,
-        backgrounds,
-        render_mode,
-    )
-
-
-def _render(
-    reference: bool,
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmats,
-    Ks,
-    width,
-    height,
-    limits,
-    sh_degree,
-    tile_size,
-    backgrounds,
-    render_mode,
-) -> tuple[Tensor, Tensor, dict]:
     _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, render_mode)
     means, quats, scales = (t if t.dim() == 3 else t[None] for t in (means, quats, scales))
     opacities = opacities if opacities.dim() == 2 else opacities[None]
     colors = colors if colors.dim() == (3 if sh_degree is None else 4) else colors[None]
-    project = _projection(reference, means, viewmats)
+    project, pixels = _projection(reference, means, viewmats), _pixels(reference, means, tile_size)
+    limits = (near_plane, far_plane, radius_clip, eps2d)
     means2d, conics, depths, radii = project(means, quats, scales, opacities, viewmats, Ks, width, height, *limits)
     features = _features(colors, means, depths, viewmats, sh_degree, render_mode)
-    pixels = _pixels(reference, means, tile_size)
     out, alphas = pixels(means2d, conics, features, opacities, radii, depths, width, height)
     notes = {"means2d": means2d, "conics": conics, "depths": depths, "radii": radii, "width": width, "height": height}
     notes |= {"opacities": opacities.expand(len(viewmats), -1), "n_cameras": len(viewmats)}
     return _finished(out, alphas, backgrounds, render_mode), alphas, notes
+
+
+def rasterization_reference(*arguments, **options) -> tuple[Tensor, Tensor, dict]:
+    """Computes `rasterization` in plain torch, as a reference: same arguments, same result to rounding; any device, float64."""
+    return rasterization(*arguments, **options, reference=True)
 
 
 def _finished(out: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:

@@ -135,7 +135,7 @@ def pixels_torch(
     height: int,
     tile_size: int = 16,
 ) -> tuple[Tensor, Tensor]:  # [C, H, W, D], [C, H, W, 1]
-    """Returns composited colors (no background) and alphas. Front to back by depth, ties to the lower index."""
+    """Returns colors (no background) and alphas by alpha blending (eq. 5.1). Front to back by depth, ties to the lower index."""
     cameras = len(means2d)
     shared = (t.expand(cameras, *t.shape[1:]) for t in (colors, opacities))
     each = zip(means2d, conics, *shared, radii, depths, strict=True)

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,12 +108,7 @@ def predict_file(
         sequences = sequences_of_split(reader, settings.input.split, data)
         flow = _choose_flow(settings, reader)
         estimator = find_estimator(flow)
-        said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
-        if settings.classical.classical:
-            said["classical"] = settings.classical.used()
-        elif settings.classical.method in ("multibody", "scene"):
-            said[settings.classical.method] = asdict(getattr(settings, settings.classical.method))
-        config = {"settings": said, **segmenter.record()}
+        config = {"settings": _record(settings, refinement), **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
@@ -123,10 +119,9 @@ def predict_file(
         if still and settings.classical.method == "multibody":
             log.warn(f"{data}: one frame shows no motion: all is one part in {first_names(still)}")
         if force or not already_made(target, entry, PartsReader, WORK):
-            for line in (
-                taken_for_meters(reader.path, reader.length_unit) if settings.classical.method == "scene" else ()
-            ):
-                log.warn(line)
+            if settings.classical.method == "scene":
+                for line in taken_for_meters(reader.path, reader.length_unit):
+                    log.warn(line)
             with PartsWriter(
                 target,
                 num_parts=segmenter.slots,
@@ -141,6 +136,15 @@ def predict_file(
             ) as writer:
                 _predict_sequences(reader, sequences, work, writer, fields, spread, settings.classical)
         return _close(target, drawings, settings.classical.method == "scene")
+
+
+def _record(settings: PredictSettings, refinement: Refinement) -> dict[str, Any]:
+    """Returns the settings that shape the result, for the file's provenance: of the methods only the one that is used."""
+    method = settings.classical.method
+    said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
+    if settings.classical.classical:
+        return said | {"classical": settings.classical.used()}
+    return said | ({method: asdict(getattr(settings, method))} if method in ("multibody", "scene") else {})
 
 
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:

@@ -13,6 +13,7 @@ SPINS = (-0.4, 0.4)  # radians
 _HINGES, _ACROSS = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])  # axes of the edges turned about, and where they lie
 _TURNED = np.array([*np.tile(np.repeat(_HINGES, len(ANGLES)), 2), 2, 2])  # the axis of each turn and spin
 _ANGLES = np.array([*ANGLES * 8, *SPINS])
+_LLOYD_ROUNDS = 5  # of k-means
 
 
 def turn_about(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
@@ -69,19 +70,19 @@ def choose_distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, 
     return chosen[:found].tolist()
 
 
-def cluster_patches(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
+def cluster_patches(points: np.ndarray, count: int) -> np.ndarray:
     """Returns the patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
     center = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
     patch = np.zeros(len(points), np.int64)
-    lloyd_kernel(np.ascontiguousarray(points, np.float32), center, rounds, patch)
+    lloyd_kernel(np.ascontiguousarray(points, np.float32), center, _LLOYD_ROUNDS, patch)
     return patch
 
 
-def find_patch_centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
-    """Returns up to `most` centers (Q,3) of patches of about `each` points; none for fewer than 6 points."""
+def find_patch_centers(points: np.ndarray) -> np.ndarray:
+    """Returns up to 4 centers (Q,3) of patches of about 12 points; none for fewer than 6 points."""
     if len(points) < 6:
         return np.zeros((0, 3))
-    patch = cluster_patches(points, min(most, max(1, len(points) // each)))
+    patch = cluster_patches(points, min(4, max(1, len(points) // 12)))
     return np.stack([points[patch == k].mean(0) for k in np.unique(patch)]).astype(np.float64)
 
 

@@ -11,6 +11,11 @@ from torch import Tensor
 
 from dpcli.ops import apply_motions, fps, gather_points, knn, weighted_kabsch
 
+_SEEDS = 32  # neighborhoods that propose motions
+_TOLERANCE = (0.01, 0.04)  # diameters, bounds of the residual up to which a motion explains a point
+_GAIN = 0.03  # share of the points that a further motion has to explain
+_SMALLEST = 0.02  # share of the points that a body has at least
+
 
 @torch.no_grad()
 def rigid_groups(
@@ -18,18 +23,13 @@ def rigid_groups(
     flow: Tensor,  # [B, N, 3]
     *,
     most: int = 8,
-    seeds: int = 32,
-    tolerance: tuple[float, float] = (0.01, 0.04),
-    gain: float = 0.03,
-    smallest: float = 0.02,
 ) -> Tensor:  # [B, N]
     """Returns labels i64 (B,N), 0 = the largest body; -1 = no motion found explains the point.
 
-    Hypotheses are the motions of neighborhoods of `seeds` far-apart points, of two sizes, and of the whole. The one
-    that explains most is taken and fitted again to what it explains, then the one that explains most of the rest, until
-    a motion would gain less than the share `gain` of the points or there are `most`. A point counts as explained within
-    a tolerance: three times the median residual of the small neighborhoods' own fits, kept within the bounds
-    (diameters).
+    Hypotheses are the motions of neighborhoods of far-apart points, of two sizes, and of the whole. The one that explains
+    most is taken and fitted again to what it explains, then the one that explains most of the rest, until a motion would
+    gain less than the share _GAIN of the points or there are `most`. A point counts as explained within a tolerance: three
+    times the median residual of the small neighborhoods' own fits, kept within bounds.
 
     The left 60 points of a block stand still, the right 40 rise:
 
@@ -39,8 +39,8 @@ def rigid_groups(
     [60, 40]
     """
     moved = points + flow
-    hypotheses, noise = _hypotheses(points, moved, min(seeds, points.shape[1]))
-    bound = (3 * noise).clamp(*tolerance)[:, None]  # [B, 1]
+    hypotheses, noise = _hypotheses(points, moved, min(_SEEDS, points.shape[1]))
+    bound = (3 * noise).clamp(*_TOLERANCE)[:, None]  # [B, 1]
     cost = bound.expand(points.shape[:2]).clone()
     open_ = torch.ones(len(points), dtype=torch.bool, device=points.device)
     chosen = []
@@ -48,7 +48,7 @@ def rigid_groups(
     for _ in range(most):
         saved = (cost[:, None] - residual).clamp(min=0).sum(-1)  # [B, H]
         best = saved.argmax(1)
-        open_ = open_ & (saved.gather(1, best[:, None])[:, 0] > gain * bound[:, 0] * points.shape[1])
+        open_ = open_ & (saved.gather(1, best[:, None])[:, 0] > _GAIN * bound[:, 0] * points.shape[1])
         if not open_.any():
             break
         own = _refined(points, moved, cost, residual[torch.arange(len(points)), best], bound)
@@ -56,9 +56,7 @@ def rigid_groups(
         cost = torch.minimum(cost, own)
         chosen.append(own)
     return (
-        _labels(points, torch.stack(chosen, 1), bound, smallest)
-        if chosen
-        else torch.zeros(points.shape[:2], dtype=torch.int64)
+        _labels(points, torch.stack(chosen, 1), bound) if chosen else torch.zeros(points.shape[:2], dtype=torch.int64)
     )
 
 
@@ -95,10 +93,10 @@ def _refined(points: Tensor, moved: Tensor, cost: Tensor, residual: Tensor, boun
     return residual
 
 
-def _labels(points: Tensor, residual: Tensor, bound: Tensor, smallest: float) -> Tensor:
+def _labels(points: Tensor, residual: Tensor, bound: Tensor) -> Tensor:
     """Returns the motion (B,N) with the least residual over each point's neighbors.
 
-    Points of bodies with a smaller share than `smallest`, and unexplained ones, are -1.
+    Points of smaller bodies than _SMALLEST, and unexplained ones, are -1.
     """
     _, index = knn(points, points, min(8, points.shape[1]))
     capped = residual.clamp(max=2 * float(bound.max())).transpose(1, 2)  # [B, N, M]
@@ -107,5 +105,5 @@ def _labels(points: Tensor, residual: Tensor, bound: Tensor, smallest: float) ->
     label = torch.where(value < 2 * bound, label, -1)
     share = torch.stack([(label == m).float().mean(1) for m in range(residual.shape[1])], 1)  # [B, M]
     order = share.argsort(1, descending=True).argsort(1)
-    order = torch.where(share >= smallest, order, -1)
+    order = torch.where(share >= _SMALLEST, order, -1)
     return torch.where(label >= 0, order.gather(1, label.clamp(min=0)), -1)

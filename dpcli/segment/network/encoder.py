@@ -60,7 +60,7 @@ def _turned_back(rotations: Tensor, offsets: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Stacks blocks of separable SE(3) convolutions.
+    """Stacks blocks of separable SE(3) convolutions: the features of every point under all rotations (eq. 4.1).
 
     The first layer's centers are farthest points; later strides keep the first of them.
     """

@@ -60,7 +60,10 @@ class MotionHead(nn.Module):
         return torch.stack(slots, 1)
 
     def forward(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns confidence and residuals from `part_features` of frame 1 and, slots matched to it, of frame 2."""
+        """Returns confidence and residuals from `part_features` of frame 1 and, slots matched to it, of frame 2.
+
+        Where eq. 4.4 multiplies the features of each pair of rotations, here layers see both.
+        """
         half = self.pair.weight.chunk(2, 1)
         target, source = second @ half[0].T, first @ half[1].T + self.pair.bias
         hidden = torch.relu(source[:, :, :, None] + target[:, :, None])  # [B, S, a, l, D]

@@ -97,10 +97,7 @@ def test_pairing_takes_away_what_is_hard_for_both():
     """A constant gain under a large spread of samples: the paired interval sees it, separate ones overlap."""
     hard = np.random.default_rng(0).normal(20, 5, 30)
     tables = [{f"x{i}": {"psnr": v + shift} for i, v in enumerate(hard)} for shift in (0.2, 0)]
-    sides = [
-        metrics_of_values(name, "video", "views", table, {"psnr": "dB"})
-        for name, table in zip("AB", tables, strict=True)
-    ]
+    sides = [metrics_of_values(name, table, {"psnr": "dB"}) for name, table in zip("AB", tables, strict=True)]
     found = pair_metrics(*sides, Resampling(500)).changes["psnr"]
     assert found.interval.low == pytest.approx(0.2) == found.interval.high and found.p < 0.01
     single = Resampling(500).intervals(sides[0].metric, 30)["psnr"]
@@ -111,10 +108,7 @@ def test_bootstrap_difference_of_means_equals_scipy():
     from scipy.stats import bootstrap
 
     a, b = np.random.default_rng(0).normal(size=(2, 25))
-    sides = [
-        metrics_of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"})
-        for side in (a, b)
-    ]
+    sides = [metrics_of_values("x", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"}) for side in (a, b)]
     found = pair_metrics(*sides, Resampling(4000)).changes["m"]
     expected = bootstrap(
         (a, b),
@@ -133,8 +127,7 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
     """What a video's views or frames need: tables, notes, JSON and picture from {sample: {metric: value}}."""
     tables = [{f"view {i}": {"psnr": 20 + i + s, "lpips": 0.1 * i + s / 10} for i in range(4)} for s in (0, 1)]
     sides = [
-        metrics_of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
-        for n, table in zip("ab", tables, strict=True)
+        metrics_of_values(f"{n}.h5", table, {"psnr": "dB", "lpips": "1"}) for n, table in zip("ab", tables, strict=True)
     ]
     part = pair_metrics(*sides, Resampling(200))
     report = CompareReport(("a.h5", "b.h5"), EvaluationOptions(), Resampling(200), [part], ([], []))
@@ -153,19 +146,17 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
 
 def test_values_that_are_missing_or_infinite():
     units = {"psnr": "dB"}
-    a = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
-    b = metrics_of_values("b", "video", "views", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
+    a = metrics_of_values("a", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
+    b = metrics_of_values("b", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
     found = pair_metrics(a, b, Resampling(200)).changes["psnr"]
     assert found.difference == -1.5 and (found.a_better, found.b_better, found.ties) == (0, 2, 0)
     with pytest.raises(DataError, match="psnr of 2 views is infinite: 'y', 'z'"):
-        metrics_of_values(
-            "f", "video", "views", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units
-        )
+        metrics_of_values("f", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units)
     with pytest.raises(DataError, match="no views"):
-        metrics_of_values("f", "video", "views", {}, units)
+        metrics_of_values("f", {}, units)
     with pytest.raises(DataError, match="unit of psnr: 'dB' in a, 'bel' in c"):
-        pair_metrics(a, metrics_of_values("c", "video", "views", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
-    alone = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}}, units)
+        pair_metrics(a, metrics_of_values("c", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
+    alone = metrics_of_values("a", {"x": {"psnr": 1.0}}, units)
     only = pair_metrics(alone, alone, Resampling(200)).changes["psnr"]
     assert not only.interval.defined and np.isnan(only.p)
 
