@@ -197,6 +197,11 @@ class ClipSource:
         points = normalize(points, self.config.normalize)
         return points if self.augmentation == NONE else self.augmentation(points, rng)
 
+    def load_shown(self, clip: Clip) -> np.ndarray:
+        """Returns `load` of a clip as prediction takes it: the points drawn depend on the numbers of its frames alone, so a video has
+        the same scores alone, at another place in its file, and in a stream."""
+        return self.load(clip, 0, *clip.frames)
+
     def _slots(self, clip: Clip, rng: np.random.Generator) -> np.ndarray:
         config, number = self.config, clip.sequence
         whole = clip.frames == tuple(range(int(self.reader.frame_counts[number])))
