@@ -26,7 +26,7 @@ def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[
     """Yields clips in order as tensors (b,T,P,3); the points drawn depend on the clip alone, not on the batch."""
     for start in range(0, len(clips), size):
         chosen = clips[start : start + size]
-        arrays = [source.load(clip, clip.sequence, *clip.frames) for clip in chosen]
+        arrays = [source.load_shown(clip) for clip in chosen]
         yield chosen, torch.from_numpy(np.stack(arrays))
 
 

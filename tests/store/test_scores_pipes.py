@@ -143,3 +143,11 @@ def test_output_reaches_stdout_only_when_whole(tmp_path):
         path.write_bytes(b"half")
         raise ZeroDivisionError
     assert stream.getvalue() == b""
+
+
+@pytest.mark.parametrize(("name", "told"), [("s.h5", False), ("s.PNG", True), ("s.csv", True), ("s.scores", False)])
+def test_a_name_of_another_form_is_told(name, told, tmp_path, capsys):
+    with ScoresWriter(tmp_path / name, class_names=["a", "b"]) as writer:
+        writer.write("v", np.array([0.5, 0.5], np.float32))
+    assert ("is written as HDF5, not as" in capsys.readouterr().err) is told
+    assert ScoresReader(tmp_path / name).names == ["v"]

@@ -10,7 +10,7 @@ from typing import Any
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.likeness import file_like, tell_columns, tell_long, tell_unlike
+from dpcli.classify.data.likeness import file_like, tell_columns, tell_long, tell_rate, tell_unlike
 from dpcli.classify.data.videos import check_classes, report_backward, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
@@ -52,7 +52,7 @@ class ScoreVideo:
     seed: int
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> VideoScores:
-        """Returns the scores of a sequence; its number in the file chooses the points of its clips."""
+        """Returns the scores of a sequence; numbered: with its number in the file."""
         (number, sequence), (model, info) = numbered, self.model.get()
         source = ClipSource(OneVideo(number, sequence), [number], info.config, timing=info.timing, seed=self.seed)
         return next(predict_videos(model, source, self.clips_per_video, self.batch, self.device, self.streams))
@@ -84,6 +84,7 @@ def predict(
         report_backward(reader, source.sequences)
         tell_unlike(str(path), file_like(reader, source.sequences), info, task.model)
         tell_columns(reader, source.sequences, info, task.model)
+        tell_rate(reader, source.sequences, info, task.model)
         tell_long(reader, source.sequences, info, task.model)
         config = _record(task, weights, info, source, clips_per_video)
         confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)

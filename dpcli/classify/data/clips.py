@@ -13,7 +13,7 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.schema import kept_name
+from dpcli.store.schema import KEPT, kept_name
 
 
 @dataclass(frozen=True)
@@ -197,6 +197,11 @@ class ClipSource:
         points = normalize(points, self.config.normalize)
         return points if self.augmentation == NONE else self.augmentation(points, rng)
 
+    def load_shown(self, clip: Clip) -> np.ndarray:
+        """Returns `load` of a clip as prediction takes it: the points drawn depend on the numbers of its frames alone, so a video has
+        the same scores alone, at another place in its file, and in a stream."""
+        return self.load(clip, 0, *clip.frames)
+
     def _slots(self, clip: Clip, rng: np.random.Generator) -> np.ndarray:
         config, number = self.config, clip.sequence
         whole = clip.frames == tuple(range(int(self.reader.frame_counts[number])))
@@ -225,11 +230,15 @@ def _looks(length: int, count: int) -> list[tuple[int, ...]]:
 
 def check_columns(reader: CloudsReader | OneVideo, config: KinetConfig) -> None:
     """Raises DataError where a file, or a stream, lacks columns that the network reads."""
-    missing = [name for name in config.columns if kept_name(name) not in getattr(reader, "fields", ())]
+    fields = getattr(reader, "fields", ())
+    missing = [name for name in config.columns if kept_name(name) not in fields]
     if missing:
+        read = {*map(kept_name, config.columns)}
+        others = [name.removeprefix(KEPT) for name in fields if name.startswith(KEPT) and name not in read]
+        has = f" (the file has {', '.join(sorted(others))}: if one is the same by another name, call it so in the raw data)"
         raise DataError(
             f"{reader.path}: no column {', '.join(missing)}, which the network reads of every point; prepare the file with"
-            f" --keep-fields {','.join(config.columns)}"
+            f" --keep-fields {','.join(config.columns)}{has if others else ''}"
         )
 
 

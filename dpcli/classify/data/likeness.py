@@ -22,7 +22,12 @@ _OTHER_UNIT, _OTHER_SENSOR = 3.0, 10.0  # times as large, times as many points
 _RESTING = 10.0  # times as little as in training that a column may vary: who moves little has low speeds
 _MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
-_SHIPPED = {"extent": 0.233, "frames": 76.0}  # MSR-Action3D's training videos: the shipped networks' files don't say it
+_OTHER_RATE = 1.5  # times as many frames a second
+_SHIPPED = {
+    "extent": 0.233,
+    "frames": 76.0,
+    "interval": 1 / 15,
+}  # MSR-Action3D's training videos: the shipped networks' files don't say it
 _ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
 _FINE = 1e-5  # of coordinates up to 100: what lies in one point there is not rounded to it
@@ -42,7 +47,8 @@ def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
 
 
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
-    """Returns `like` in the median of some videos of a file, and the frames of the longest of all."""
+    """Returns `like` in the median of some videos of a file, and of all of them the frames of the longest and, where their times
+    are known, the median seconds from frame to frame."""
     found = []
     for number in list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]:
         count = int(reader.frame_counts[number])
@@ -51,7 +57,20 @@ def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float
         found.append(like([video.frame(t) for t in range(video.num_frames)]))
     found = [one for one in found if one]
     middle = {key: float(np.median([one[key] for one in found])) for key in (found[0] if found else ())}
-    return {**middle, "frames": float(reader.frame_counts[list(sequences)].max(initial=0))}
+    intervals = list(_intervals(reader, sequences).values())
+    rate = {"interval": float(np.median(intervals))} if intervals else {}
+    return {**middle, **rate, "frames": float(reader.frame_counts[list(sequences)].max(initial=0))}
+
+
+def _intervals(reader: CloudsReader, sequences: Sequence[int]) -> dict[int, float]:
+    """Returns the median seconds from frame to frame of the videos whose times rise, by sequence."""
+    found = {}
+    for i in sequences:
+        times = reader.times(i)
+        steps = np.diff(times) if times is not None else np.zeros(0)
+        if len(steps) and np.median(steps) > 0:
+            found[i] = float(np.median(steps))
+    return found
 
 
 def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
@@ -80,6 +99,31 @@ def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
             f"{reader.path}: {len(long)} of {counted(len(sequences), 'video')} over {_SEVERAL:g} times as long as any that {model} learned"
             f" from ({reader.names[long[0]]}: {reader.frame_counts[long[0]]} frames after {longest:g}), and each gets one label:"
             " --segments cuts recordings of several actions"
+        )
+
+
+def tell_rate(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
+    """Warns where frames follow each other faster or slower than in what a model of consecutive frames learned from."""
+    usual = _own(info, model).get("interval")
+    if usual and info.timing == "clips":
+        _tell_rate(reader, sequences, usual, f"in what {model} learned from")
+
+
+def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], timing: str) -> None:
+    """Warns where some training videos have another frame rate than most, of which clips of consecutive frames know nothing."""
+    intervals = list(_intervals(reader, sequences).values()) if timing == "clips" else []
+    if intervals:
+        _tell_rate(reader, sequences, float(np.median(intervals)), "in the median video")
+
+
+def _tell_rate(reader: CloudsReader, sequences: Sequence[int], usual: float, where: str) -> None:
+    found = _intervals(reader, sequences)
+    others = [i for i, own in found.items() if not usual / _OTHER_RATE < own < usual * _OTHER_RATE]
+    if others:
+        log.warn(
+            f"{reader.path}: another frame rate in {len(others)} of {counted(len(sequences), 'video')} (frames of"
+            f" {reader.names[others[0]]} are {found[others[0]]:.3g} s apart, {usual:.3g} {where}); clips are consecutive frames, so"
+            " actions are faster or slower in them: prepare the faster videos with --stride, or train with --timing uniform"
         )
 
 

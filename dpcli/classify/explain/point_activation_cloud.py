@@ -174,7 +174,7 @@ def raw_points(source: ClipSource, clip: Clip) -> np.ndarray:
     plain = ClipSource(
         source.reader, [clip.sequence], source.config.changed(normalize="none"), timing=source.timing, seed=source.seed
     )
-    return plain.load(clip, clip.sequence, *clip.frames)
+    return plain.load_shown(clip)
 
 
 def _in_network_coordinates(sequence: CloudSequence, drawn: np.ndarray, points: np.ndarray) -> list[np.ndarray]:

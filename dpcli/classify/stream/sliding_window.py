@@ -93,7 +93,7 @@ def window_size(info: ModelInfo, window: int | None) -> int:
 class StreamPredictor:
     """Predicts every `hop` frames, first when the window is full. Memory does not grow.
 
-    The points drawn depend on the seed and the frames' numbers, as in `ClipSource.load` for a file's first video: with hop 1
+    The points drawn depend on the seed and the frames' numbers, as in `ClipSource.load_shown`: with hop 1
     these are the clips that batch prediction takes, and the last `mean` is the video's score.
     """
 
@@ -150,7 +150,7 @@ class StreamPredictor:
 
     def _predict(self) -> Prediction:
         clip = self.clip()
-        points = self._source.load(clip, clip.sequence, *clip.frames)
+        points = self._source.load_shown(clip)
         scores = self._scores(torch.from_numpy(points)[None])
         self.clips += 1
         self._sum += scores

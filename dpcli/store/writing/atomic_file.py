@@ -12,7 +12,21 @@ import h5py
 
 from dpcli.errors import DataError, DpcError
 from dpcli.file_lock import open_alone
+from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import check_regular, disk_full, not_writable, put_in_place
+
+_OTHER_FORMS = frozenset(
+    ".png .jpg .jpeg .gif .svg .pdf .mp4 .html .htm .csv .tsv .xlsx .json .txt .md .ply .pcd .obj .npy .npz".split()
+)
+
+
+def _tell_other_form(target: Path) -> None:
+    """Warns where a name promises a picture, a page, a table or the like, which no program would find in an HDF5 file."""
+    if target.suffix.lower() in _OTHER_FORMS:
+        log.warn(
+            f"{target}: is written as HDF5, not as {target.suffix}; name it .h5 (pictures, pages and tables have options of their"
+            " own: --help)"
+        )
 
 
 class _HeldOpen(h5py.File):
@@ -44,6 +58,7 @@ class AtomicFile:
         if self.target.is_dir():
             raise DataError(f"{self.target}: is a folder; name a file in it")
         check_regular(self.target)
+        _tell_other_form(self.target)
         self._lock = -1
         try:
             self._lock = open_alone(self.part)

@@ -105,6 +105,23 @@ def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc_here, tmp_p
     assert np.array_equal(a, b)
 
 
+def test_a_video_has_the_same_scores_at_any_place_of_any_file(data, run_folder, dpc_here, tmp_path):
+    reader, found = CloudsReader(data), {}
+    for name, order in (("all", range(12)), ("turned", range(11, -1, -1)), ("alone", [7])):
+        with CloudsWriter(tmp_path / f"{name}-clouds.h5", class_names=reader.class_names) as writer:
+            for i in order:
+                writer.write(reader.read(i))
+        dpc_here(
+            *("classify", "predict", tmp_path / f"{name}-clouds.h5", "--model", run_folder, "--split", "all"),
+            *("-o", tmp_path / f"{name}.h5"),
+        )
+        scores = ScoresReader(tmp_path / f"{name}.h5")
+        found[name] = dict(zip(scores.names, np.stack([scores.scores, *scores.streams.values()], 1)))
+    for others in (found["turned"], found["alone"]):
+        for video, scores in others.items():
+            np.testing.assert_array_equal(scores, found["all"][video])
+
+
 def test_runs_are_called_by_the_seed_of_their_training(data, run_folder, dpc_here, tmp_path):
     """Not by the prediction's, which is 0 for all."""
     for name in ("a", "b"):

@@ -15,6 +15,8 @@ from dpcli.classify.data.likeness import (
     like,
     tell_columns,
     tell_long,
+    tell_mixed_rates,
+    tell_rate,
     tell_rounded,
     tell_unlike,
     tell_values,
@@ -86,6 +88,34 @@ def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):
     assert "1 of 2 videos over 5 times as long as any" in capsys.readouterr().err
     _tell_unlabeled(reader, ("train",))
     assert "1 video of the split 'train' without a label, left out: long" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("rates", "model", "timing", "odd"),
+    [
+        ((15, 16, 0), "msraction3d-24", "clips", ""),
+        ((30, 15, 0), "msraction3d-24", "clips", "1 of 3 videos (frames of v0 are 0.0333 s apart, 0.0667 in what"),
+        ((30, 30, 30), "msraction3d-24", "uniform", ""),  # frames spread over the video
+        ((30, 25, 10), None, "clips", "1 of 3 videos (frames of v2 are 0.1 s apart, 0.04 in the median video)"),
+        ((30, 10, 10), None, "slots", ""),
+        ((0, 0, 30), None, "clips", ""),  # times that stand still say nothing
+    ],
+)
+def test_another_frame_rate_is_told_where_clips_are_consecutive_frames(rates, model, timing, odd, capsys, tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", fields=["time"]) as writer:
+        for number, rate in enumerate(rates):
+            sequence = CloudSequence.from_frames(f"v{number}", body())
+            sequence.time = np.arange(4) / rate if rate else np.zeros(4)
+            writer.write(sequence)
+    reader = CloudsReader(tmp_path / "c.h5")
+    if model is None:
+        tell_mixed_rates(reader, range(3), timing)
+    else:
+        tell_rate(reader, range(3), ModelInfo(KinetConfig(), ["a"], timing), SHIPPED / f"{model}.safetensors")
+    err = " ".join(capsys.readouterr().err.split())
+    assert odd in err and bool(odd) == bool(err)
+    if rates == (30, 25, 10):
+        assert file_like(reader, range(3))["interval"] == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize(

@@ -320,7 +320,7 @@ def test_all_points_go_where_normalization_took_the_drawn_ones(data, rule):
     clip = source.clips(1)[0]
     drawn = raw_points(source, clip)
     moved = normalize(drawn, rule)
-    np.testing.assert_array_equal(moved, source.load(clip, clip.sequence, *clip.frames))  # prediction's own points
+    np.testing.assert_array_equal(moved, source.load_shown(clip))  # prediction's own points
     queries = _in_network_coordinates(source.reader.read(0, clip.frames), drawn, moved)
     for query, frame in zip(queries, moved):
         distance = np.linalg.norm(query[:, None] - frame[None], axis=-1)
@@ -449,7 +449,7 @@ def test_video_features_are_means_of_what_the_last_layers_read(model, data):
     for row, sequence in enumerate(source.sequences):
         clips = [clip for clip in source.clips(None) if clip.sequence == sequence]
         assert len(clips) == 2
-        points = torch.from_numpy(np.stack([source.load(clip, sequence, *clip.frames) for clip in clips]))
+        points = torch.from_numpy(np.stack([source.load_shown(clip) for clip in clips]))
         with torch.no_grad():
             static, dynamic = (logits.mean(0).numpy() for logits in model(points))
             groups = model.group(points)

@@ -332,6 +332,7 @@ def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
         ("name,label\na,-1\n", "labels.csv:2: label -1 is out of range"),
         ("name,label\na,1\na,2\n", "labels.csv:3: 'a' appears twice"),
         ("name,label\na,1,2\n", "labels.csv:2: 'a,1,2'; expected name,label"),
+        ("name,label\na,\n", "labels.csv:2: 'a,'; expected name,label .leave the line out where the label isn't known"),
         ("name,label\na\n", "labels.csv:2"),
         ("name,color\na,1\n", "labels.csv:1: columns name,color"),
         ("name,label\na,1\nb,two\n", "some labels are numbers and some are words"),
