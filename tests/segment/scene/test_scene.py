@@ -224,6 +224,22 @@ def test_what_had_to_be_guessed_is_told(change, unit, warned, capsys):
     assert not capsys.readouterr().err  # nothing had to be guessed in the street itself
 
 
+def box_room(length, width, rng):
+    """A frame inside four walls, a floor and a ceiling, seen from the middle by a lidar of 16 rows."""
+    turn, rise = np.meshgrid(np.linspace(-np.pi, np.pi, 900, endpoint=False), np.radians(np.linspace(-15, 15, 16)))
+    rays = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        reach = (np.array([length, width, 2.5]) / 2 / np.abs(rays)).min(1)
+    return rays * (reach + rng.normal(0, 0.01, len(rays)))[:, None]
+
+
+@pytest.mark.parametrize(("length", "told"), [(300.0, True), (8.0, False)])
+def test_a_corridor_that_does_not_show_how_far_the_sensor_went_is_told(length, told, capsys):
+    rng = np.random.default_rng(0)
+    explained(changed([box_room(length, 4.0, rng) for _ in range(3)]))
+    assert ("how far it went is uncertain" in capsys.readouterr().err) == told
+
+
 def test_one_frame_of_a_map_that_fits_the_sensor_does_not_speak_for_all(capsys):
     first, second, last = frames_of(street())
     explained(changed([first[::9] + [7, 30, 0], second[::9], np.concatenate([last, last])]), [(0, 1)])
