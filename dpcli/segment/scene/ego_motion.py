@@ -14,6 +14,9 @@ _STEP = 2.5  # meters between the starts of the search
 _STEPS = {0: 20, 1: 20, 2: 30}
 _BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
 _DIGITS = 9  # of a motion that are kept: Open3D adds in the order in which threads end, and the last digits differ
+_ACROSS = (
+    0.08  # mean square of the normals along the level direction that they show least, from which on it is shown well
+)
 _NEAR = 0.5  # meters: a point this near to the other frame's has a partner
 OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
 
@@ -32,6 +35,15 @@ def register_frames(frames: list[np.ndarray], ground: list[np.ndarray]) -> tuple
         before = motion if share >= OVERLAP else before
         poses.append(poses[-1] @ before)
     return np.stack(poses), np.array(shares)
+
+
+def shows_the_way(points: np.ndarray, ground: np.ndarray) -> bool:
+    """Returns whether a frame f64 (N,3), z up, has surfaces across every level direction, which tell how far a sensor moved.
+
+    Corridors, guardrails and open land hardly have any. ground: bool (N).
+    """
+    normals = np.asarray(_thin_frame(points, ground)[1].normals)[:, :2]
+    return bool(np.linalg.eigvalsh(normals.T @ normals / max(len(normals), 1))[0] >= _ACROSS)
 
 
 def _thin_frame(points: np.ndarray, ground: np.ndarray) -> list:

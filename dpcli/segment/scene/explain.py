@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.segment.scene.ego_motion import OVERLAP, register_frames
+from dpcli.segment.scene.ego_motion import OVERLAP, register_frames, shows_the_way
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
 from dpcli.segment.scene.moving_objects import find_moving_objects
@@ -27,7 +27,8 @@ class SceneExplanation:
     pose: f64 (T,4,4), frame to world, in the input's own coordinates and unit; objects: motion f64 (4,4) in that world
     from its first frame to each that it was met in; confidence: of each, 0.5 to 1. apart: frames that overlap with none
     before them. dropped: objects beyond the most that are kept. ground_seen: whether a plane showed what is up; sensor_known:
-    whether one of the places fits. Both are true where no two frames were compared.
+    whether one of the places fits; way_shown: whether surfaces stand across every way that the sensor may have gone. All are
+    true where no two frames were compared.
     """
 
     labels: list[np.ndarray]
@@ -38,6 +39,7 @@ class SceneExplanation:
     dropped: int
     ground_seen: bool = True
     sensor_known: bool = True
+    way_shown: bool = True
 
     def motion(self, part: int, source: int, target: int) -> np.ndarray:
         """Returns the rigid motion f64 (4,4) of a part, 0 for what stands, from one frame's coordinates to another's.
@@ -60,13 +62,15 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
     filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
     poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
-    dropped, ground_seen, sensor_known = 0, True, True
+    dropped, ground_seen, sensor_known, way_shown = 0, True, True, True
     if len(filled) > 1:
         shown = [frames[t] for t in filled]
         largest = max(shown, key=len)
         eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
         sensor_known = eye is not None and all(_may_be_sensor(shown[t], eye) for t in (0, -1))
         world, own, turn, apart, ground_seen = _build_world(shown, eye, settings)
+        widest = max(world.frames, key=lambda frame: len(frame.points))
+        way_shown = shows_the_way(widest.points, widest.height < settings.ground)
         every = find_moving_objects(world, settings)
         found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
         for number, one in enumerate(found, 1):
@@ -77,7 +81,7 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
         objects = [_in_input_axes(one, filled, turn) for one in found]
     confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
     far = [filled[t] for t in apart]
-    return SceneExplanation(labels, poses, objects, confidence, far, dropped, ground_seen, sensor_known)
+    return SceneExplanation(labels, poses, objects, confidence, far, dropped, ground_seen, sensor_known, way_shown)
 
 
 def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:

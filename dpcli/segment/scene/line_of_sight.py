@@ -7,19 +7,24 @@ from scipy.spatial import cKDTree
 
 _NEIGHBORS = 6
 _SAMPLE = 4000  # points that tell where the sensor stood
+_ROWS = 1.2  # distances between rows that beams lie beside a place: the rows below and above it, of which one may see over an edge
+_AIMED = 0.1  # distances between rows up to which a single row meets a place
+_SAME_ROW = 0.8  # the same for beams of one row
 
 
 class LineOfSight:
     """Tells which places a sensor looked through. Points are f64 (N,3), z up, in the sensor's frame; `origin` (3) is its eye.
 
-    Directions are compared in units of the distance between beams, along rows and across them.
+    Directions are compared in units of the distance between beams, along rows and across them; `rows`: how many of the
+    latter a beam may be away from a place that it lies beside.
     """
 
-    def __init__(self, points: np.ndarray, origin: np.ndarray):
+    def __init__(self, points: np.ndarray, origin: np.ndarray, rows: float = _ROWS):
         self._origin = origin
         direction, self._range = self._directions(points)
         self.across, self.along = _beam_spacing(direction)
-        self._scale = np.array([1 / (2 * self.along), 1 / (0.8 * self.across)])
+        self._elevation = direction[:, 1]
+        self._scale = np.array([1 / (2 * self.along), 1 / (rows * self.across)])
         self._tree = cKDTree(self._scaled(direction), boxsize=[2 * np.pi * self._scale[0], 0])
 
     def _directions(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -32,16 +37,22 @@ class LineOfSight:
         turned[:, 0] = np.minimum(turned[:, 0], np.nextafter(2 * np.pi * self._scale[0], 0))
         return turned
 
-    def beside(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the range (M) of places (M,3), and those f64 (M,K) of the beams beside them, infinite where none is."""
+    def beside(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the range (M) of places (M,3), those f64 (M,K) of the beams beside them, infinite where none is, and how
+        many rows (M,K) these lie above the places.
+        """
         direction, reach = self._directions(places)
         index = self._tree.query(self._scaled(direction), k=_NEIGHBORS, distance_upper_bound=1.0)[1]
-        return reach, np.append(self._range, np.inf)[index]
+        above = (np.append(self._elevation, np.nan)[index] - direction[:, 1:]) / self.across
+        return reach, np.append(self._range, np.inf)[index], above
 
     def look(self, places: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Returns bool (M): whether all beams beside a place (M,3), two at least, end more than `margin` (M) behind it."""
-        reach, ends = self.beside(places)
-        return (np.isfinite(ends).sum(1) >= 2) & (ends.min(1) > reach + margin)
+        """Returns bool (M): whether all beams beside a place (M,3) end more than `margin` (M) behind it, two at least, and
+        such that the place isn't above all of them or below: the outermost rows see past what lies outside them.
+        """
+        reach, ends, above = self.beside(places)
+        between = (above > -_AIMED).any(1) & (above < _AIMED).any(1)
+        return between & (np.isfinite(ends).sum(1) >= 2) & (ends.min(1) > reach + margin)
 
 
 def _beam_spacing(direction: np.ndarray) -> tuple[float, float]:
@@ -62,9 +73,9 @@ def range_jumps(points: np.ndarray, origin: np.ndarray) -> float:
 
     It is small at the true place, where only outlines of objects count, and larger elsewhere, whence far and near mix.
     """
-    sight = LineOfSight(points, origin)
+    sight = LineOfSight(points, origin, _SAME_ROW)
     some = points[np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(int)]
-    reach, ends = sight.beside(some)
+    reach, ends, _ = sight.beside(some)
     known = np.isfinite(ends)
     jumps = np.abs(np.log(np.where(known, ends, 1) / np.maximum(reach, 1e-9)[:, None])) > 0.1
     return float((jumps & known).sum() / max(known.sum(), 1))

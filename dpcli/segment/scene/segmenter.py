@@ -86,7 +86,7 @@ class SceneSegmenter(Segmenter):
 
     def _tell(self, name: str, apart: list[int], found: SceneExplanation, repeats: int) -> None:
         """Warns of what was assumed: of frames whose place is unknown, since they overlap with none before them, of objects
-        left out, of an unknown sensor or ground, and of frames that repeat others.
+        left out, of an unknown sensor, ground or way, and of frames that repeat others.
         """
         if found.dropped:
             log.warn(
@@ -108,6 +108,11 @@ class SceneSegmenter(Segmenter):
             log.warn(
                 f"{name}: no ground plane was found, so which way is up is a guess; where the ground was removed,"
                 " give --set ground=0.02, else turn the clouds so that an axis points up"
+            )
+        if not found.way_shown:
+            log.warn(
+                f"{name}: hardly anything stands across some way that the sensor may have gone (a corridor, a tunnel, open land),"
+                " so how far it went is uncertain; compare its speed below with what you know: if that is wrong, so is what moves"
             )
         if repeats:
             log.warn(f"{name}: {counted(repeats, 'frame')} looked at once with the one before: the points are the same")

@@ -20,6 +20,7 @@ _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one
 _UNSTEADY = 2.5  # times the evidence for something that could only be tracked with a jerk
 _ALIKE = (0.3, 0.25)  # the same for two pieces of one object
 _APART = 1.5  # meters between pieces of one object
+_THROUGH = 0.05  # share of a piece's points that the motion of the whole may take to where a frame sees through
 
 
 @dataclass
@@ -151,7 +152,7 @@ def _bridge(whole: MovingObject, one: MovingObject) -> np.ndarray:
 
 
 def _one_body(whole: MovingObject, one: MovingObject, world: World) -> bool:
-    """Returns whether a piece touches a larger one where that goes, and moves as it does."""
+    """Returns whether a piece touches a larger one where that goes, and moves as it does, or may as well."""
     gaps = []
     for t, own in one.points.items():
         frame = world.frames[t]
@@ -161,8 +162,19 @@ def _one_body(whole: MovingObject, one: MovingObject, world: World) -> bool:
         body = moved(world.frames[near].points[whole.points[near]], whole.between(near, t))
         if len(body) == 0:
             return False
-        gaps.append(float(np.median(cKDTree(body).query(frame.points[own])[0])))
+        points = frame.points[own]
+        gaps.append(float(np.median(cKDTree(body).query(points)[0])))
         for u in one.points:
-            if abs(u - t) == 1 and not _alike(frame.points[own], whole.between(t, u), one.between(t, u), _ALIKE):
+            way, both = whole.between(t, u), t in whole.points and u in whole.points
+            alike = abs(u - t) != 1 or _alike(points, way, one.between(t, u), _ALIKE)
+            if not alike and not (both and _may_follow(points, way, world.frames[u])):
                 return False
     return min(gaps) < _APART
+
+
+def _may_follow(points: np.ndarray, motion: np.ndarray, frame: Frame) -> bool:
+    """Returns whether nothing in a frame contradicts a motion (4,4) of points (N,3).
+
+    A side that is seen along its length shows few columns of points, which wander over it and seem to have a speed of their own.
+    """
+    return bool(frame.cost(moved(points, motion))[1].mean() <= _THROUGH)

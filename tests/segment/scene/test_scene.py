@@ -35,13 +35,17 @@ def street() -> CloudSequence:
         Mover("car", car(rng), np.array([14.0, 1.75]), np.pi, 9.0),
         Mover("person", person(rng), np.array([6.0, -4.6]), 0.0, 1.8, legs=2),
     ]
+    return scanned(standing, movers, rng, LIDAR)
+
+
+def scanned(standing, movers, rng, lidar) -> CloudSequence:
     clouds, parts, poses = [], [], []
     for time in (0.0, 0.1, 0.2):
         to_lidar = np.linalg.inv(planar_pose(np.array([0, -1.75]), 0.0, 8.0, 0.1, time))
-        to_lidar[2, 3] -= LIDAR.height
+        to_lidar[2, 3] -= lidar.height
         world = [standing, *(mover.surface(time) for mover in movers)]
-        owner = np.repeat(np.arange(3), [len(one) for one in world])
-        seen, triangle = scan(np.concatenate(world) @ to_lidar[:3, :3].T + to_lidar[:3, 3], LIDAR, 0.02, 0.05, rng)
+        owner = np.repeat(np.arange(len(world)), [len(one) for one in world])
+        seen, triangle = scan(np.concatenate(world) @ to_lidar[:3, :3].T + to_lidar[:3, 3], lidar, 0.02, 0.05, rng)
         clouds.append(seen)
         parts.append(owner[triangle])
         poses.append(np.stack([to_lidar, *(to_lidar @ mover.pose(time) for mover in movers)]))
@@ -81,6 +85,14 @@ def test_what_moves_is_found_and_the_rest_stands():
         ids, counts = np.unique(label[true == k], return_counts=True)
         assert counts.max() > 0.9 * counts.sum() and ids[counts.argmax()] > 0
         assert all((own[part == k] == ids[counts.argmax()]).any() for own, part in zip(labels, truth))
+
+
+def test_the_side_of_a_car_that_comes_near_is_no_object_of_its_own():
+    rng = np.random.default_rng(2)
+    standing, lidar = standing_street(rng), Lidar(tuple(np.linspace(2, -22, 48)), 900, 60.0)
+    sequence = scanned(standing, [Mover("car", car(rng), np.array([15.0, 1.75]), np.pi, 9.0)], rng, lidar)
+    label = np.concatenate(explained(sequence)[0])
+    assert len(np.unique(label[sequence.part > 0])) == 2 and (label[sequence.part > 0] == 1).mean() > 0.9
 
 
 def test_the_flow_is_that_of_the_true_poses_and_agrees_with_the_motions():
@@ -212,6 +224,22 @@ def test_what_had_to_be_guessed_is_told(change, unit, warned, capsys):
     assert not capsys.readouterr().err  # nothing had to be guessed in the street itself
 
 
+def box_room(length, width, rng):
+    """A frame inside four walls, a floor and a ceiling, seen from the middle by a lidar of 16 rows."""
+    turn, rise = np.meshgrid(np.linspace(-np.pi, np.pi, 900, endpoint=False), np.radians(np.linspace(-15, 15, 16)))
+    rays = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        reach = (np.array([length, width, 2.5]) / 2 / np.abs(rays)).min(1)
+    return rays * (reach + rng.normal(0, 0.01, len(rays)))[:, None]
+
+
+@pytest.mark.parametrize(("length", "told"), [(300.0, True), (8.0, False)])
+def test_a_corridor_that_does_not_show_how_far_the_sensor_went_is_told(length, told, capsys):
+    rng = np.random.default_rng(0)
+    explained(changed([box_room(length, 4.0, rng) for _ in range(3)]))
+    assert ("how far it went is uncertain" in capsys.readouterr().err) == told
+
+
 def test_one_frame_of_a_map_that_fits_the_sensor_does_not_speak_for_all(capsys):
     first, second, last = frames_of(street())
     explained(changed([first[::9] + [7, 30, 0], second[::9], np.concatenate([last, last])]), [(0, 1)])
@@ -324,6 +352,20 @@ def test_beams_end_behind_what_is_free_and_before_what_is_hidden():
     places = np.array([[5.0, 0.1, 0.2], [15.0, 0.1, 0.2], [9.95, 0.1, 0.2], [-5.0, 0.1, 0.2]])
     assert sight.look(places, np.full(4, 0.2)).tolist() == [True, False, False, False]
     assert range_jumps(np.concatenate(rows), np.zeros(3)) < 0.01
+
+
+def test_what_one_row_alone_sees_past_is_not_free():
+    angle = np.linspace(-0.5, 0.5, 400)
+    beams = np.stack([np.stack([np.cos(angle), np.sin(angle), np.full(400, z)], 1) for z in np.linspace(-0.1, 0.1, 20)])
+    far = LineOfSight(10 * beams.reshape(-1, 3), np.zeros(3))
+    near = np.repeat(np.where(np.arange(20) < 10, 4.0, 10.0), 400)[:, None]  # a hood below a roof that is seen flat
+    edge = LineOfSight(near * beams.reshape(-1, 3), np.zeros(3))
+    between = np.array([[6.0, 0.1, 6 * z] for z in np.linspace(-0.0045, 0.0045, 10)])
+    assert far.look(between, np.full(10, 0.1)).all()
+    assert not edge.look(between, np.full(10, 0.1)).any()
+    outside = np.array([[5.0, 0.1, 0.525], [5.0, 0.1, -0.525]])  # half a row above the uppermost, and below the lowest
+    assert not far.look(outside, np.full(2, 0.1)).any()
+    assert far.look(outside * [1, 1, 0.95], np.full(2, 0.1)).all()
 
 
 def test_gaps_between_clusters_grow_with_distance_and_with_the_rows_of_beams():
