@@ -135,12 +135,61 @@ def tables_inside(path: Path) -> list[str]:
     found: list[str] = []
 
     def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            _require_type(item, path)
         if "pandas_type" in item.attrs if isinstance(item, h5py.Group) else item.dtype.names:
             found.append(name)
 
     with reading(path), h5py.File(path, "r") as file:
         file.visititems(note)
     return [name for name in found if not any(name.startswith(f"{other}/") for other in found)]
+
+
+def read_tables(path: Path) -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    """Returns the tables of `tables_inside` by name: their columns (N, or N and several) as stored, and their attributes."""
+    names = tables_inside(path)
+    if not names or not is_hdf5(path):
+        arrays = _read_all(path, path.stat().st_size, path.stat().st_mtime_ns) if names else {}
+        flat = {name: np.asarray(arrays[name]).reshape(-1) for name in names}
+        return {name: ({own: one[own] for own in one.dtype.names or ()}, {}) for name, one in flat.items()}
+    with reading(path), _hdf5_of_others(path) as file:
+        return {name: _table_of(file[name], path) for name in names}
+
+
+def _table_of(item: Any, path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Returns columns and attributes of a data set of a compound type, or of a group of pandas, whose kinds are ``table`` and
+    ``fixed``.
+    """
+    import h5py
+
+    if isinstance(item, h5py.Dataset) or "table" in item:
+        rows = item if isinstance(item, h5py.Dataset) else item["table"]
+        values = _checked(rows, path)[()].reshape(-1)
+        return {name: values[name] for name in values.dtype.names}, dict(rows.attrs)
+    found, about = {}, {}
+    for place in range(len(item)):
+        if f"block{place}_items" in item:
+            names = [str(one, "utf-8", "replace") for one in _checked(item[f"block{place}_items"], path)[()].tolist()]
+            values = _checked(item[f"block{place}_values"], path)[()]
+            if values.ndim == 2 and values.shape[1] == len(names):  # texts are a pickle
+                found |= dict(zip(names, values.T))
+                about |= {f"{name}_dtype": item[f"block{place}_values"].attrs.get("value_type", "") for name in names}
+    index = item.get("axis1")
+    if index is not None and index.dtype.kind in "uif" and found:
+        name = str(np.asarray(index.attrs.get("name", b"N.")).astype(str))
+        found = {"index" if name == "N." else name: _checked(index, path)[()], **found}  # a pickle of None
+    return found, about
+
+
+def _checked(item: h5py.Dataset, path: Path) -> h5py.Dataset:
+    """Returns a data set. Raises DataError where its bytes are missing, elsewhere, or packed by a filter that is missing."""
+    if item.is_virtual or item.external:
+        raise DataError(f"{path}: {item.name} keeps its data in another file; copy them into one (h5repack)")
+    from dpcli.store.file import refuse_claim
+
+    refuse_claim(item, path)
+    _refuse_filters(item, path)
+    return item
 
 
 def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
@@ -158,10 +207,9 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
 
 
 @contextmanager
-def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+def _hdf5_of_others(path: Path) -> Iterator[h5py.File]:
     import h5py
 
-    from dpcli.store.file import refuse_claim
     from dpcli.store.heap_check import check_heaps
 
     check_heaps(path)
@@ -170,6 +218,16 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             raise DataError(
                 f"{path}: dpc made it; `dpc info {path}` says what it holds, and what comes next reads it as it is"
             )
+        yield file
+
+
+@contextmanager
+def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+    import h5py
+
+    from dpcli.store.file import refuse_claim
+
+    with _hdf5_of_others(path) as file:
         matlab = path.suffix.lower() == ".mat"
         found: dict[str, Array | list[np.ndarray]] = {}
         for name, item in _datasets(file, path):
@@ -187,6 +245,16 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
                 marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
                 found[name] = Reversed(item) if matlab else Unpacked(item, scaled) if scaled or marked else item
         yield found
+
+
+def _require_type(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError for a data set of a type that h5py has no numbers for, such as PyTables' times."""
+    try:
+        _ = item.dtype
+    except TypeError as error:
+        raise DataError(
+            f"{path}: {item.name} is of a type that isn't read ({error}); write it without, such as times as Float64Col"
+        ) from None
 
 
 def _is_bare_dimension(item: h5py.Dataset) -> bool:
@@ -218,6 +286,7 @@ def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
         if len(found) > _MOST:
             raise DataError(f"{path}: holds more than {_MOST} data sets; join those of one sequence")
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # #refs#, the contents of MATLAB's cells
+            _require_type(item, path)
             if item.is_virtual or item.external:
                 raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
             found.append((name, item))
@@ -254,7 +323,11 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
         arrays = {one.filename[: -len(".npy")]: _member(path, archive.read(one)) for one in members}
-    return {name: array for name, array in arrays.items() if isinstance(array, list) or array.dtype.kind in "uifb"}
+    return {
+        name: array
+        for name, array in arrays.items()
+        if isinstance(array, list) or array.dtype.kind in "uifb" or array.dtype.names
+    }
 
 
 def _npy(path: Path) -> np.ndarray | list[np.ndarray]:

@@ -80,25 +80,6 @@ def test_a_filter_that_is_missing_is_named(tmp_path):
             arrays["points"][()]
 
 
-@pytest.mark.parametrize("form", ["PyTables", "pandas", "NumPy"])
-def test_tables_of_named_columns_are_told_from_arrays(tmp_path, form):
-    table = np.zeros(50, [("frame", "i4"), ("x", "f4"), ("y", "f4"), ("z", "f4")])
-    path = tmp_path / ("a.npy" if form == "NumPy" else "a.h5")
-    if form == "NumPy":
-        np.save(path, table)
-    else:
-        with h5py.File(path, "w") as file:
-            if form == "PyTables":
-                file["points"] = table
-            else:
-                file["df/block0_values"] = np.zeros((50, 3))
-                file["df"].attrs["pandas_type"] = "frame"
-    words = ("prepare", "clouds", path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
-    for options, said in (([], "holds a table"), (["--frame-column", "frame"], "need it as .csv or .parquet")):
-        run = told(*words, *options)
-        assert run.returncode == 3 and said in run.stderr and "--frame-column" in run.stderr
-
-
 def test_masks_of_truth_values_leave_points_out(tmp_path):
     """As h5py writes NumPy's bool."""
     mask = np.random.default_rng(6).random((6, 40)) < 0.6
