@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables, told_units
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_frame_column, find_trios, unit_of_comments
 from dpcli.prepare.scans.times_of_tables import seconds_of
 
@@ -159,7 +159,7 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
             alike = {name: one for name, one in own.items() if rows and rows in (one.shape[0], one.size)}
             columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in alike.items()}, {})
             if columns and _are_points(columns):
-                told = {name: str(getattr(one, "attrs", {}).get("units", "")) for name, one in alike.items()}
+                told = {name: told_units(one) for name, one in alike.items()}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}
                 found[group] = (columns, {name: units for name, units in told.items() if units})
     return found

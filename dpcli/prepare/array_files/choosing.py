@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dpcli.prepare.array_files.axes import are_poses, coordinates_axis
+from dpcli.prepare.array_files.containers import attributes_of
 from dpcli.prepare.reader import natural_key
-from dpcli.runtime.clips.name_numbers import NumberColumns, parse_names
+from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_names
 
 POINT_KEYS = (
     "points",
@@ -41,6 +42,10 @@ _MASKS = re.compile(r"(.*_)?(valid|mask|is_valid)(_.*)?", re.IGNORECASE)
 _COUNTS = re.compile(
     r"(n|num|number|valid|real)_?(of_)?(points?|pts)(_.*)?|lengths?|(point_?|pts_?)?counts?|sizes?", re.IGNORECASE
 )
+_FRAMES = frozenset(  # words beside the numbers of groups that are frames
+    "frame frames f scan scans sweep sweeps cloud clouds pc pcd step steps timestep timesteps time times timestamp timestamps stamp"
+    " stamps t ts".split()
+)
 _LABELS = re.compile(r"labels?|y|class(es)?|targets?|actions?|gestures?", re.IGNORECASE)
 
 _LOOKED_AT, _TELLING = 512, 8  # rows of an array that are looked at, and that are enough to tell what they hold
@@ -50,12 +55,25 @@ _OF_LENGTH_ONE = 1e-3  # how far lengths of rounded directions are from 1
 @dataclass(frozen=True)
 class Source:
     """Says where one sequence of clouds lies in a file: in these arrays (each a frame, where they are several), and at this
-    place of the only one's sequences, None where it holds one.
+    place of the only one's sequences, None where it holds one. counted: what each of several arrays is called, or its group, with
+    the number that orders them.
     """
 
     keys: tuple[str, ...]
     name: str = ""
     place: int | None = None
+    counted: tuple[Name, ...] = ()
+
+    @property
+    def group(self) -> str:
+        """Returns the name of the group in which the arrays lie, or, where each frame has a group, that of these."""
+        above = self.keys[0].rpartition("/")[0]
+        return above.rpartition("/")[0] if self.have_groups else above
+
+    @property
+    def have_groups(self) -> bool:
+        """Returns whether each frame has a group of its own, in which its array lies."""
+        return len(self.keys) > 1 and len({key.rpartition("/")[2] for key in self.keys}) == 1
 
 
 def find_sources(arrays: Mapping[str, Any], axes: str = "") -> list[Source]:
@@ -110,18 +128,27 @@ def _sequences(array: Any, axes: str) -> int | None:
 def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
     """Returns the sequences of arrays (N,3 or more) whose names a number counts, one for each group of them.
 
-    Those that begin with places and go on with whole numbers or directions are the points, colors, normals and triangles of one
-    cloud (``numpy.savez(file, points, colors)``, XDMF's ``data0`` and ``data1``).
+    Where they are called points, the number may be that of their groups (``frame_0001/points``). Those that begin with places and
+    go on with whole numbers or directions are the points, colors, normals and triangles of one cloud (``numpy.savez(file, points,
+    colors)``, XDMF's ``data0`` and ``data1``).
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[tuple[str, str], list[str]] = {}
     for name, one in arrays.items():
         if not isinstance(one, list) and one.ndim in (1, 2) and one.dtype.kind in "uif":
             if 0 in one.shape or one.ndim == 2 and 3 <= one.shape[1] <= 10:
-                groups.setdefault(name.rpartition("/")[0], []).append(name)
+                above, _, own = name.rpartition("/")
+                inside = own if above and own.lower() in POINT_KEYS else ""
+                groups.setdefault((above.rpartition("/")[0] if inside else above, inside), []).append(name)
     found = []
-    for group, names in groups.items():
-        last = [name.rpartition("/")[2] + "." for name in names]  # no suffix: a point may stand in a number
-        named = list(zip(parse_names(last), names))
+    for (group, inside), names in groups.items():
+        if group and _counts_frames(
+            group.rpartition("/")[2], words=1
+        ):  # clouds of one frame, such as of several sensors
+            continue
+        own = [name.removesuffix(f"/{inside}").rpartition("/")[2] for name in names]
+        if inside and not all(map(_counts_frames, own)):
+            continue
+        named = list(zip(parse_names([f"{one}." for one in own]), names))  # no suffix: a point may stand in a number
         shapes = {own.shape for own, name in named if 0 not in arrays[name].shape}
         named = [(own, name) for own, name in named if own.shape in shapes]  # nothing was seen in those without points
         if (
@@ -130,13 +157,27 @@ def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
             or len((columns := NumberColumns([own for own, _ in named])).varying()) != 1
         ):
             continue
-        ordered = [name for _, name in sorted(named, key=lambda pair: columns.key(pair[0]))]
+        counted, ordered = zip(*sorted(named, key=lambda pair: columns.key(pair[0])))
         filled = [arrays[name] for name in ordered if 0 not in arrays[name].shape]
         if len({one.dtype.kind == "f" for one in filled}) == 1 and not _has_normals(filled):
-            found.append(Source(tuple(ordered), group))
+            found.append(Source(ordered, group, counted=counted))
+    found = [one for one in found if one.have_groups] or found
     if len(found) == 1:
-        return [Source(found[0].keys)]
+        return [replace(found[0], name="")]
+    if len({one.name for one in found}) < len(found):  # frame_1/points beside frame_1/vertices
+        found = [replace(one, name="/".join(filter(None, (one.name, one.keys[0].rpartition("/")[2])))) for one in found]
     return sorted(found, key=lambda one: natural_key(one.name))
+
+
+def _counts_frames(name: str, words: int = 0) -> bool:
+    """Returns whether a group's name is a number, alone (unless ``words`` are needed) or beside words that say that it counts
+    frames.
+
+    >>> _counts_frames("frame_0001"), _counts_frames("17"), _counts_frames("object_3"), _counts_frames("points")
+    (True, True, False, False)
+    """
+    found = [word.lower() for word in re.findall(r"[^\W\d_]+", name)]
+    return len(found) >= words and set(found) <= _FRAMES and any(letter.isdecimal() for letter in name)
 
 
 def _has_normals(parts: list[Any]) -> bool:
@@ -169,6 +210,75 @@ class Beside:
         return {self.times, self.colors, self.mask, self.counts, self.labels} - {""}
 
 
+def beside_frames(arrays: Mapping[str, Any], source: Source) -> Beside:
+    """Returns what lies beside frames of their own sizes, which are arrays that a number counts, or a list: a time or a label for
+    each of these.
+    """
+    count = len(source.keys) if len(source.keys) > 1 else len(arrays[source.keys[0]])
+    group = source.group
+
+    def named(pattern: re.Pattern[str]) -> str:
+        return _only_fitting(arrays, group, pattern, [(count,)])
+
+    if source.place is not None:  # a list of sequences
+        return Beside(labels=named(_LABELS))
+    times = named(_TIMES)
+    if not times and group and not source.name:  # the only ones of the file
+        times = _only_fitting(arrays, group.rpartition("/")[0], _TIMES, [(count,)])
+    return Beside(times=times, labels=named(_LABELS) or find_labels_of_clouds(arrays, source))
+
+
+def find_times_of_groups(arrays: Mapping[str, Any], source: Source) -> list[str]:
+    """Returns the names of the single numbers that tell the time of each frame in its group; [] without them."""
+    return _of_groups(arrays, source, _TIMES)
+
+
+def find_labels_of_clouds(arrays: Mapping[str, Any], source: Source) -> str:
+    """Returns the name of the number, or attribute, that labels each of several clouds whose names are plain numbers, so that they
+    may be samples rather than frames; "" without.
+    """
+    plain = len(source.keys) > 1 and not any(re.search(r"[^\W\d_]", one.text) for one in source.counted)
+    if plain and (names := _of_groups(arrays, source, _LABELS)):
+        return names[0].rpartition("/")[2]
+    told = [attributes_of(arrays[key]) for key in source.keys] if plain else [{}]
+    return next((name for name in told[0] if _LABELS.fullmatch(name) and all(name in one for one in told)), "")
+
+
+def _of_groups(arrays: Mapping[str, Any], source: Source, pattern: re.Pattern[str]) -> list[str]:
+    """Returns the names of single numbers called alike, one in the group of each frame; [] without them."""
+    groups = [key.rpartition("/")[0] for key in source.keys] if source.have_groups else []
+    first = {name.rpartition("/")[2] for name in arrays if groups and name.rpartition("/")[0] == groups[0]}
+    for own in sorted(filter(pattern.fullmatch, first)):
+        names = [f"{group}/{own}" for group in groups]
+        if all(getattr(arrays.get(name), "shape", None) in ((), (1,)) for name in names):
+            return names
+    return []
+
+
+def says_times(name: str) -> bool:
+    """Returns whether a name says that it holds times.
+
+    >>> says_times("timestamps"), says_times("t_ms"), says_times("depth")
+    (True, True, False)
+    """
+    return _TIMES.fullmatch(name) is not None
+
+
+def _only_fitting(
+    arrays: Mapping[str, Any], group: str, pattern: re.Pattern[str], shapes: Sequence[tuple[int, ...]]
+) -> str:
+    """Returns the only array of a group whose name and shape fit, "" where there is none or several."""
+    fitting = [
+        name
+        for name, one in arrays.items()
+        if not isinstance(one, list)
+        and name.rpartition("/")[0] == group
+        and pattern.fullmatch(name.rpartition("/")[2])
+        and _plain(one.shape) in map(_plain, shapes)
+    ]
+    return fitting[0] if len(fitting) == 1 else ""
+
+
 def find_beside(arrays: Mapping[str, Any], key: str, axes: str) -> Beside:
     """Returns what lies beside the array ``key`` and fits its shape. axes: a letter for each of its axes."""
     sides = dict(zip(axes, arrays[key].shape))
@@ -178,15 +288,7 @@ def find_beside(arrays: Mapping[str, Any], key: str, axes: str) -> Beside:
     of_frames = tuple(sides[letter] for letter in axes if letter in "BT")
 
     def named(pattern: re.Pattern[str], *shapes: tuple[int, ...]) -> str:
-        fitting = [
-            name
-            for name, one in arrays.items()
-            if not isinstance(one, list)
-            and name.rpartition("/")[0] == group
-            and pattern.fullmatch(name.rpartition("/")[2])
-            and _plain(one.shape) in map(_plain, shapes)
-        ]
-        return fitting[0] if len(fitting) == 1 else ""
+        return _only_fitting(arrays, group, pattern, shapes)
 
     sequences = sides.get("B", 0)
     first = sides["T"] if "T" in sides and not sequences else 0  # labels of frames, or of clouds that make no sequence

@@ -76,6 +76,18 @@ class Unreadable:
         raise self._error
 
 
+def told_units(array: Any) -> str:
+    """Returns what the attribute ``units`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05", "" without one."""
+    told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
+    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
+
+
+def attributes_of(array: Any) -> Mapping[str, Any]:
+    """Returns the attributes of an HDF5 data set, and of its group where it has none of a name; none of other arrays."""
+    dataset = getattr(array, "_dataset", array)
+    return {**dataset.parent.attrs, **dataset.attrs} if hasattr(dataset, "attrs") else {}
+
+
 def _attribute(dataset: Any, name: str, default: float) -> float:
     """Returns the number that an attribute tells, the default where it tells none."""
     told = np.ravel(dataset.attrs.get(name, default))
@@ -234,7 +246,7 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
                 refuse_claim(item, path)
                 found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uifb" and item.ndim and not _is_bare_dimension(item):
+            elif item.dtype.kind in "uifb" and item.shape is not None and not _is_bare_dimension(item):
                 try:
                     refuse_claim(item, path)
                     _refuse_filters(item, path)
@@ -326,7 +338,7 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
     return {
         name: array
         for name, array in arrays.items()
-        if isinstance(array, list) or array.dtype.kind in "uifb" or array.dtype.names
+        if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -17,17 +16,34 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
-from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, others_inside, tables_inside
+from dpcli.prepare.array_files.choosing import (
+    Beside,
+    Source,
+    beside_frames,
+    find_beside,
+    find_sources,
+    find_times_of_groups,
+    says_times,
+)
+from dpcli.prepare.array_files.containers import (
+    SUFFIXES,
+    attributes_of,
+    made_by_dpc,
+    open_arrays,
+    others_inside,
+    tables_inside,
+    told_units,
+)
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
-from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.scans.tracked_points import identify, with_track
-from dpcli.prepare.series import TEXTS, is_beside, is_hidden
+from dpcli.prepare.series import TEXTS, evenly, is_beside, is_hidden, missing_numbers
+from dpcli.prepare.times_beside import seconds_beside
+from dpcli.runtime.clips.name_numbers import NumberColumns
 
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
@@ -139,14 +155,21 @@ class ArraySequences(OwnScans):
         source: Source = item.extra["source"]
         with open_arrays(item.path) as arrays:
             beside, axes = self._beside(item.path, arrays, source)
-            timed = self.fps is not None or (beside.times and _times(arrays, beside, axes, source) is not None)
+            timed = self.fps is not None or _times(arrays, beside, axes, source) is not None
             return bool(timed), bool(beside.colors)
 
     def _beside(self, path: Path, arrays: Mapping[str, Any], source: Source) -> tuple[Beside, str]:
         """Returns what lies beside the array of one sequence, and the letters of its axes, "" of lists and single frames."""
         array = arrays[source.keys[0]]
-        if isinstance(array, list) or len(source.keys) > 1 or array.ndim == 2:
-            return Beside(), ""
+        if isinstance(array, list) or len(source.keys) > 1:
+            beside = beside_frames(arrays, source)
+            if beside.labels and source.place is None and not self.axes:
+                count = len(source.keys) if len(source.keys) > 1 else len(array)
+                raise DataError(
+                    f"{path}: has a number in {beside.labels!r} for each of its {count} clouds; if these are the frames of one"
+                    " sequence, give --axes TNC, if each is a sample of its own, save it to a file in a folder of its own"
+                )
+            return beside, ""
         facts = path.stat()
         axes = self.axes or _axes(path, source.keys[0], facts.st_size, facts.st_mtime_ns)
         if not axes:
@@ -212,13 +235,13 @@ class ArraySequences(OwnScans):
             }
             time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(arrays, beside, axes, source, frames)
-            unit = unit_of_comments([f"units: {_told_units(arrays[source.keys[0]])}"])
+            unit = unit_of_comments([f"units: {told_units(arrays[source.keys[0]])}"])
         if item.extra["time"] and time is None:
             if not self.fps:
                 raise DataError(
                     f"{item.path}: no array beside its clouds tells times that rise, though the first file has one"
                 )
-            time = np.arange(len(frames)) / self.fps
+            time = _at_rate(source, len(frames), self.fps)
         if item.extra["color"] and colors is None:
             raise DataError(f"{item.path}: no colors beside its clouds, though the first file has them")
         clouds = [
@@ -280,6 +303,10 @@ class ArraySequences(OwnScans):
                 keys = dict.fromkeys(key for own in sources for key in own.keys)
                 alike = [key for key in keys if axes and len(axes) == getattr(arrays[key], "ndim", 0)]
                 beside = [name for key in alike for name in find_beside(arrays, key, axes).named()]
+                for own in sources if not axes else ():
+                    beside += [*beside_frames(arrays, own).named(), *find_times_of_groups(arrays, own)]
+                if not self._first[0] or self.fps:  # what doesn't rise isn't read
+                    beside = [name for name in beside if not says_times(name)]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]
@@ -291,6 +318,8 @@ class ArraySequences(OwnScans):
         columns = shape[axes.index("C")] if axes else max(told, default=3)
         said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
         said += f"; {source.keys[0]} to {source.keys[-1]} taken as its frames" if len(source.keys) > 1 else ""
+        missing = missing_numbers(NumberColumns(source.counted).running_numbers()) if source.counted else []
+        said += f", without {first_names(missing, 5)}" if missing else ""
         said += f"; of each point the first 3 of {columns} numbers are read" if 3 < columns else ""
         return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
 
@@ -362,12 +391,6 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
     return [_as_points(one.T if by_columns else one) if one.size else np.zeros((0, 3), np.float32) for one in parts]
 
 
-def _told_units(array: Any) -> str:
-    """Returns what the attribute ``units`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05", "" without one."""
-    told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
-    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
-
-
 def _as_points(array: np.ndarray) -> np.ndarray:
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
     return array[..., :3].astype(kind)
@@ -384,15 +407,32 @@ def _of_frames(array: Any, axes: str, shape: tuple[int, ...], place: int | None)
     )
 
 
+def _at_rate(source: Source, count: int, fps: float) -> np.ndarray:
+    """Returns the seconds of frames, f64 (T), by their numbers where names tell them, so that what is missing leaves a gap."""
+    columns = NumberColumns(source.counted)
+    numbers = columns.running_numbers() if source.counted and columns.times() is None else None
+    return (np.arange(count) if numbers is None else evenly(numbers)) / fps
+
+
 def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
-    """Returns seconds since the first frame, f64 (T), that an array tells; None where it tells none that rise."""
-    if not beside.times:
+    """Returns seconds since the first frame, f64 (T), that an array tells, or a number or an attribute of each frame, or the names
+    of these; None where nothing tells times that rise.
+    """
+    if beside.times:
+        array = arrays[beside.times]
+        shape = arrays[source.keys[0]].shape if axes else ()
+        return seconds_beside(beside.times, array, _of_frames(array, axes, shape, source.place) if axes else array[()])
+    if len(source.keys) < 2:
         return None
-    array = arrays[beside.times]
-    values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place).astype(np.float64)
-    name, unit = beside.times.rpartition("/")[2], re.match(r"[^\W\d]+", _told_units(array))
-    since = (values - values[0]) * seconds_of(f"{name} [{unit[0]}]" if unit else name, values)
-    return since if len(since) < 2 or (np.diff(since) > 0).all() else None
+    if names := find_times_of_groups(arrays, source):
+        first = arrays[names[0]]
+        return seconds_beside(names[0], first, np.array([np.asarray(arrays[name][()]).item() for name in names]))
+    told = [attributes_of(arrays[key]) for key in source.keys]
+    for name in filter(says_times, told[0]):
+        values = [np.asarray(one.get(name, "")) for one in told]
+        if all(one.size == 1 and one.dtype.kind in "uif" for one in values):
+            return seconds_beside(name, None, np.array([one.item() for one in values]))
+    return NumberColumns(source.counted).times()
 
 
 def _real_points(
