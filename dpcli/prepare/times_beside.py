@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.array_files.containers import told_units
 from dpcli.prepare.scans.times_of_tables import clock_seconds, seconds_of
 from dpcli.prepare.series import Series, TimesBeside
 from dpcli.text_files import decode_text
@@ -46,7 +44,7 @@ def with_times(series: Series, root: Path) -> Series:
     return series
 
 
-def seconds_beside(name: str, array: Any, values: np.ndarray) -> np.ndarray | None:
+def seconds_beside(name: str, values: np.ndarray, units: str = "") -> np.ndarray | None:
     """Returns seconds since the first, f64 (T), of numbers that an array beside frames holds, in the unit that its name or its
     attribute ``units`` says; None where they don't rise, or the unit isn't known.
     """
@@ -55,7 +53,7 @@ def seconds_beside(name: str, array: Any, values: np.ndarray) -> np.ndarray | No
         since = (values - values[:1]) / np.timedelta64(1, "s")
     else:
         values, name = values.astype(np.float64), f"time {name.rpartition('/')[2]}"  # whatever else it is called
-        unit = re.match(r"[^\W\d]+", told_units(array))
+        unit = re.match(r"[^\W\d]+", units)
         since = values - values[:1]
         since *= seconds_of(f"{name} [{unit[0]}]" if unit else name, values) if len(values) else 1
     return since if len(since) < 2 or (np.diff(since) > 0).all() else None

@@ -25,6 +25,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
+PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 

@@ -421,17 +421,19 @@ def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source)
     if beside.times:
         array = arrays[beside.times]
         shape = arrays[source.keys[0]].shape if axes else ()
-        return seconds_beside(beside.times, array, _of_frames(array, axes, shape, source.place) if axes else array[()])
+        return seconds_beside(
+            beside.times, _of_frames(array, axes, shape, source.place) if axes else array[()], told_units(array)
+        )
     if len(source.keys) < 2:
         return None
     if names := find_times_of_groups(arrays, source):
-        first = arrays[names[0]]
-        return seconds_beside(names[0], first, np.array([np.asarray(arrays[name][()]).item() for name in names]))
+        values = np.array([np.asarray(arrays[name][()]).item() for name in names])
+        return seconds_beside(names[0], values, told_units(arrays[names[0]]))
     told = [attributes_of(arrays[key]) for key in source.keys]
     for name in filter(says_times, told[0]):
         values = [np.asarray(one.get(name, "")) for one in told]
         if all(one.size == 1 and one.dtype.kind in "uif" for one in values):
-            return seconds_beside(name, None, np.array([one.item() for one in values]))
+            return seconds_beside(name, np.array([one.item() for one in values]))
     return NumberColumns(source.counted).times()
 
 

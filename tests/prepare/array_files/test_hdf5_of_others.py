@@ -39,8 +39,8 @@ def test_data_sets_that_were_never_written_refuse_no_others(tmp_path):
     with h5py.File(tmp_path / "c.h5", "w") as file:
         file["depth"] = np.full((5, 40, 50), 900, np.uint16)
         file.create_dataset("labels", (5,), "i4")
-    depth, beside = archived_depth(tmp_path / "c.h5")
-    assert depth.shape == (5, 40, 50) and not beside
+    found = archived_depth(tmp_path / "c.h5")
+    assert found.depth.shape == (5, 40, 50) and not found.small
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file.create_dataset("points", (6, 40, 3), "f4")
     run = told("prepare", "clouds", tmp_path / "b.h5", "-o", tmp_path / "b.out.h5", "--jobs", 1, "--item-seconds", 0)
