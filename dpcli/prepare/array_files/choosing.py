@@ -38,7 +38,13 @@ _TIMES = re.compile(
     r"(.*[/_.])?(times?|time_?stamps?|stamps?|t|ts|seconds)([_ ]?\(?\[?(s|sec|ms|us|ns)\]?\)?)?", re.IGNORECASE
 )
 _COLORS = re.compile(r"colou?rs?|rgb", re.IGNORECASE)
-_MASKS = re.compile(r"(.*_)?(valid|mask|is_valid)(_.*)?", re.IGNORECASE)
+_MASKS = re.compile(  # of valid points: those of padding, ground, persons and the like are none
+    r"(((points?|pts|xyz|cloud|pc)_?)?(masks?|is_?valid|valid(ity)?)|(valid|masks?)_?(masks?|points?|pts|xyz|cloud|pc))",
+    re.IGNORECASE,
+)
+_FRAME_COUNTS = re.compile(
+    r"(n|num|number)_?(of_)?frames?|frames?_?(counts?|lengths?|lens?)|seq(uence)?_?(lengths?|lens?)", re.IGNORECASE
+)
 _COUNTS = re.compile(
     r"(n|num|number|valid|real)_?(of_)?(points?|pts)(_.*)?|lengths?|(point_?|pts_?)?counts?|sizes?", re.IGNORECASE
 )
@@ -204,10 +210,11 @@ class Beside:
     mask: str = ""
     counts: str = ""
     labels: str = ""
+    frames: str = ""
 
     def named(self) -> set[str]:
         """Returns the names of all that are there."""
-        return {self.times, self.colors, self.mask, self.counts, self.labels} - {""}
+        return {*vars(self).values()} - {""}
 
 
 def beside_frames(arrays: Mapping[str, Any], source: Source) -> Beside:
@@ -255,6 +262,15 @@ def _of_groups(arrays: Mapping[str, Any], source: Source, pattern: re.Pattern[st
     return []
 
 
+def says_label(name: str) -> bool:
+    """Returns whether a name says that it holds labels.
+
+    >>> says_label("y"), says_label("walk_1/label"), says_label("time")
+    (True, True, False)
+    """
+    return _LABELS.fullmatch(name.rpartition("/")[2]) is not None
+
+
 def says_times(name: str) -> bool:
     """Returns whether a name says that it holds times.
 
@@ -295,7 +311,8 @@ def find_beside(arrays: Mapping[str, Any], key: str, axes: str) -> Beside:
     return Beside(
         times=named(_TIMES, of_frames, (sides.get("T", 0),)) if "T" in sides else "",
         colors=named(_COLORS, whole),
-        mask=named(_MASKS, flat),
+        mask=named(_MASKS, flat, tuple(1 if letter == "C" else length for letter, length in zip(axes, whole))),
         counts=named(_COUNTS, of_frames) if "N" in sides else "",
         labels=named(_LABELS, (sequences or first,)) if sequences or first > 1 else "",
+        frames=named(_FRAME_COUNTS, (sequences,)) if sequences and "T" in sides else "",
     )

@@ -23,6 +23,7 @@ from dpcli.prepare.array_files.choosing import (
     find_beside,
     find_sources,
     find_times_of_groups,
+    says_label,
     says_times,
 )
 from dpcli.prepare.array_files.containers import (
@@ -45,6 +46,7 @@ from dpcli.prepare.series import TEXTS, evenly, is_beside, is_hidden, missing_nu
 from dpcli.prepare.times_beside import seconds_beside
 from dpcli.runtime.clips.name_numbers import NumberColumns
 
+MORE_FRAMES = "frames behind the counts of their files dropped"
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
 _LOOKED_AT = 20  # files of a folder, of which the first good one tells
@@ -155,7 +157,7 @@ class ArraySequences(OwnScans):
         source: Source = item.extra["source"]
         with open_arrays(item.path) as arrays:
             beside, axes = self._beside(item.path, arrays, source)
-            timed = self.fps is not None or _times(arrays, beside, axes, source) is not None
+            timed = self.fps is not None or _times(item.path, arrays, beside, axes, source) is not None
             return bool(timed), bool(beside.colors)
 
     def _beside(self, path: Path, arrays: Mapping[str, Any], source: Source) -> tuple[Beside, str]:
@@ -207,7 +209,8 @@ class ArraySequences(OwnScans):
             if (
                 len(values) != len(own)
                 or (values != np.floor(values)).any()
-                or values.min() < 0
+                or values.min() < -1  # of those that nobody knows
+                or values.max() < 0
                 or values.max() > _MOST_CLASSES
             ):
                 return None
@@ -233,9 +236,10 @@ class ArraySequences(OwnScans):
             kept = {
                 name: self._column(item.path, arrays, name, source, axes) for name in with_track(self.keep, self.track)
             }
-            time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
-            real = _real_points(arrays, beside, axes, source, frames)
+            time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
+            real = _real_points(item.path, arrays, beside, axes, source, frames)
             unit = unit_of_comments([f"units: {told_units(arrays[source.keys[0]])}"])
+            wanted = _frame_count(item.path, arrays, beside, source, len(frames))
         if item.extra["time"] and time is None:
             if not self.fps:
                 raise DataError(
@@ -254,17 +258,18 @@ class ArraySequences(OwnScans):
             for t, frame in enumerate(frames)
         ]
         identify(item.path, clouds, self.track, self.keep)
-        dropped = sum(int(np.count_nonzero(~own)) for own in real)
+        dropped = sum(int(np.count_nonzero(~own)) for own in real[:wanted])
         for cloud, own in zip(clouds, real):
             cloud.keep(own)
-        clouds = clouds[:: self.stride]
+        more, clouds = len(clouds) - wanted, clouds[: wanted : self.stride]
         sample = assemble(
             item,
             clouds,
             Lengths(self.scale, self.unit),
             color=item.extra["color"],
-            time=None if time is None else time[:: self.stride],
+            time=None if time is None else time[: wanted : self.stride],
         )
+        sample.notes |= {MORE_FRAMES: more} if more else {}
         sample.notes |= {UNCOUNTED: dropped} if dropped else {}
         return sample
 
@@ -307,6 +312,8 @@ class ArraySequences(OwnScans):
                     beside += [*beside_frames(arrays, own).named(), *find_times_of_groups(arrays, own)]
                 if not self._first[0] or self.fps:  # what doesn't rise isn't read
                     beside = [name for name in beside if not says_times(name)]
+                if self._table is None or self.labels or self.label_from_folder:
+                    beside = [name for name in beside if not says_label(name)]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]
@@ -414,16 +421,15 @@ def _at_rate(source: Source, count: int, fps: float) -> np.ndarray:
     return (np.arange(count) if numbers is None else evenly(numbers)) / fps
 
 
-def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
+def _times(path: Path, arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
     """Returns seconds since the first frame, f64 (T), that an array tells, or a number or an attribute of each frame, or the names
     of these; None where nothing tells times that rise.
     """
     if beside.times:
         array = arrays[beside.times]
-        shape = arrays[source.keys[0]].shape if axes else ()
-        return seconds_beside(
-            beside.times, _of_frames(array, axes, shape, source.place) if axes else array[()], told_units(array)
-        )
+        values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place) if axes else np.asarray(array[()])
+        stop = _frame_count(path, arrays, beside, source, len(values))  # behind it may be anything
+        return seconds_beside(beside.times, values[:stop], told_units(array))
     if len(source.keys) < 2:
         return None
     if names := find_times_of_groups(arrays, source):
@@ -437,12 +443,33 @@ def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source)
     return NumberColumns(source.counted).times()
 
 
+def _frame_count(path: Path, arrays: Mapping[str, Any], beside: Beside, source: Source, stored: int) -> int:
+    """Returns how many frames of a sequence are no padding, by the counts beside them. Raises DataError where it can't be."""
+    if not beside.frames:
+        return stored
+    told = float(np.asarray(arrays[beside.frames][()]).reshape(-1)[source.place])
+    if not 1 <= told <= stored or told != int(told):
+        raise DataError(
+            f"{path}: {beside.frames!r} tells {told:g} frames of a sequence that has {stored}; expected 1 to {stored}"
+        )
+    return int(told)
+
+
 def _real_points(
-    arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source, frames: list[np.ndarray]
+    path: Path, arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source, frames: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Returns which points of each frame are no padding, by the counts or the mask beside them: bool (N) each."""
+    """Returns which points of each frame are no padding, by the counts or the mask beside them: bool (N) each. Raises DataError
+    where a mask holds more than two values, such as the numbers of objects.
+    """
     if beside.mask:
-        return list(_cut(arrays[beside.mask], axes.replace("C", ""), source.place) != 0)
+        own = axes if arrays[beside.mask].ndim == len(axes) else axes.replace("C", "")
+        mask = _cut(arrays[beside.mask], own, source.place).reshape(len(frames), -1)
+        if len(values := np.unique(mask)) > 2:
+            raise DataError(
+                f"{path}: {beside.mask!r} holds {len(values)} different numbers, expected two: points that are valid and others;"
+                " call it otherwise if it is no mask"
+            )
+        return list(mask != 0)
     if beside.counts:
         counts = _of_frames(arrays[beside.counts], axes, arrays[source.keys[0]].shape, source.place)
         return [np.arange(len(frame)) < count for frame, count in zip(frames, counts)]
