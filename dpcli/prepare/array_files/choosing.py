@@ -196,8 +196,10 @@ def _has_normals(parts: list[Any]) -> bool:
     return not are_directions(parts[0]) and any(map(are_directions, parts[1:]))
 
 
-def _plain(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Returns a shape without the axis of length 1 that MATLAB gives to every list."""
+def _plain(shape: tuple[int, ...] | None) -> tuple[int, ...] | None:
+    """Returns a shape without the axis of length 1 that MATLAB gives to every list; None of none."""
+    if shape is None:
+        return None
     return tuple(length for length in shape if length != 1) if len(shape) <= 2 else tuple(shape)
 
 
@@ -286,11 +288,10 @@ def _only_fitting(
     """Returns the only array of a group whose name and shape fit, "" where there is none or several."""
     fitting = [
         name
-        for name, one in arrays.items()
-        if not isinstance(one, list)
-        and name.rpartition("/")[0] == group
+        for name in arrays
+        if name.rpartition("/")[0] == group
         and pattern.fullmatch(name.rpartition("/")[2])
-        and _plain(one.shape) in map(_plain, shapes)
+        and _plain(getattr(arrays[name], "shape", None)) in map(_plain, shapes)
     ]
     return fitting[0] if len(fitting) == 1 else ""
 

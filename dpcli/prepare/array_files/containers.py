@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +26,7 @@ _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
 PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
+_names: dict[tuple[Path, int, int], dict[str, None]] = {}  # of the arrays in the HDF5 file that was opened last
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -78,8 +79,11 @@ class Unreadable:
 
 
 def told_units(array: Any) -> str:
-    """Returns what the attribute ``units`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05", "" without one."""
-    told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
+    """Returns what the attribute ``units`` or ``unit`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05"; ""
+    without one.
+    """
+    attributes = getattr(array, "attrs", {})
+    told = np.ravel(attributes.get("units", attributes.get("unit", ""))).tolist()
     return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
 
 
@@ -213,6 +217,9 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
     if is_hdf5(path):
         with reading(path), h5py.File(path, "r") as file:
             names = [name for name, item in _datasets(file, path) if not _is_bare_dimension(item)]
+            links: list[tuple[str, Any]] = []
+            file.visititems_links(lambda name, link: links.append((name, link)))
+            names += [f"{name} (in {link.filename})" for name, link in links if isinstance(link, h5py.ExternalLink)]
     elif path.suffix.lower() == ".npz":
         with reading(path), open_archive(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -236,28 +243,65 @@ def _hdf5_of_others(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+    facts = path.stat()
+    state = path, facts.st_size, facts.st_mtime_ns
+    with _hdf5_of_others(path) as file:
+        if state not in _names:
+            shown = {name: _shown(file, item, path) for name, item in _datasets(file, path)}
+            found = {name: array for name, array in shown.items() if array is not None}
+            _names.clear()  # of the file before
+            _names[state] = dict.fromkeys(found)
+        else:
+            found = {}
+        yield _ByName(_names[state], lambda name: _shown(file, file[name], path), found)
+
+
+class _ByName(Mapping[str, Any]):
+    """Opens the arrays of a file whose names are known as they are asked for: sequences are read one by one from files with
+    thousands of arrays.
+    """
+
+    def __init__(self, names: Mapping[str, None], show: Callable[[str], Any], found: dict[str, Any]) -> None:
+        self._names, self._show, self._found = names, show, found
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._found:
+            if name not in self._names:
+                raise KeyError(name)
+            self._found[name] = self._show(name)
+        return self._found[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.ndarray] | None:
+    """Returns a data set as its numbers are meant, the list of a MATLAB cell; None of anything else."""
     import h5py
 
     from dpcli.store.file import refuse_claim
 
-    with _hdf5_of_others(path) as file:
-        matlab = path.suffix.lower() == ".mat"
-        found: dict[str, Array | list[np.ndarray]] = {}
-        for name, item in _datasets(file, path):
-            if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
-                refuse_claim(item, path)
-                found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uifb" and item.shape is not None and not _is_bare_dimension(item):
-                try:
-                    refuse_claim(item, path)
-                    _refuse_filters(item, path)
-                except DataError as error:
-                    found[name] = Unreadable(item, error)
-                    continue
-                scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
-                marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
-                found[name] = Reversed(item) if matlab else Unpacked(item, scaled) if scaled or marked else item
-        yield found
+    if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
+        refuse_claim(item, path)
+        return _cells(file, item, path) or None
+    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item):
+        return None
+    try:
+        refuse_claim(item, path)
+        _refuse_filters(item, path)
+    except DataError as error:
+        return Unreadable(item, error)
+    if path.suffix.lower() == ".mat":
+        return Reversed(item)
+    scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
+    marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
+    return Unpacked(item, scaled) if scaled or marked else item
 
 
 def _require_type(item: h5py.Dataset, path: Path) -> None:

@@ -355,7 +355,9 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
     wanted = (
         f"{len(axes)} axes (--axes {axes})" if axes else "shape (frames, points, 3) or (sequences, frames, points, 3)"
     )
-    raise DataError(f"{path}: holds {first_names(shapes, 5) or 'no arrays of numbers'}; expected an array of {wanted}")
+    others = "" if shapes else first_names(others_inside(path, arrays), 3)
+    held = first_names(shapes, 5) or f"no arrays of numbers{f', but {others}' if others else ''}"
+    raise DataError(f"{path}: holds {held}; expected an array of {wanted}")
 
 
 def _which(path: Path, shape: tuple[int, ...]) -> str:

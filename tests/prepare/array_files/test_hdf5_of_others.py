@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
+from dpcli.prepare.array_files import containers
 from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import archived_depth
 from dpcli.prepare.scans.array_sequences import ArraySequences
@@ -122,3 +123,38 @@ def test_what_every_sequence_of_a_file_reads_is_not_named(tmp_path):
         reader = ArraySequences(tmp_path / name)
         items = reader.items()
         assert len(items) == 2 and reader.summary(items)[0].endswith(said)
+
+
+def test_what_lies_in_another_file_is_named_and_not_followed(tmp_path):
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["points"] = clouds()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = h5py.ExternalLink("b.h5", "/points")
+    assert "no arrays of numbers, but points (in b.h5)" in ArraySequences(tmp_path / "a.h5").items()[0].problem
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["xyz"] = clouds() + 1
+    reader = ArraySequences(tmp_path / "a.h5")
+    assert "not read: points (in b.h5)" in reader.summary(reader.items())[0]
+
+
+def test_a_unit_may_be_called_unit(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = clouds() * 1000
+        file["points"].attrs["unit"] = "mm"
+    assert np.allclose(np.stack(frames_of(tmp_path / "a.h5")), clouds(), atol=1e-6)
+
+
+def test_sequences_of_a_file_of_many_arrays_are_opened_by_name(tmp_path, monkeypatch):
+    """Each of hundreds would else look at thousands of arrays."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for walk in range(20):
+            for frame in range(5):
+                file[f"walk_{walk}/{frame}/points"] = clouds()[frame] + walk
+    reader = ArraySequences(tmp_path / "a.h5")
+    items = reader.items()
+    looked, shown = [], containers._shown
+    monkeypatch.setattr(
+        containers, "_shown", lambda file, item, path: looked.append(item.name) or shown(file, item, path)
+    )
+    sample = reader.read(items[7], np.random.default_rng(0)).sequence
+    assert np.allclose(sample.points, (clouds()[:5] + 7).reshape(-1, 3)) and len(set(looked)) == 5
