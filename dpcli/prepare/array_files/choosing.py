@@ -259,9 +259,27 @@ def _of_groups(arrays: Mapping[str, Any], source: Source, pattern: re.Pattern[st
     first = {name.rpartition("/")[2] for name in arrays if groups and name.rpartition("/")[0] == groups[0]}
     for own in sorted(filter(pattern.fullmatch, first)):
         names = [f"{group}/{own}" for group in groups]
-        if all(getattr(arrays.get(name), "shape", None) in ((), (1,)) for name in names):
+        if all(_is_single(arrays.get(name)) for name in names):
             return names
     return []
+
+
+def _is_single(array: Any) -> bool:
+    return hasattr(array, "shape") and array.ndim <= 2 and np.prod(array.shape) == 1
+
+
+def find_label(arrays: Mapping[str, Any], source: Source) -> float | None:
+    """Returns the one number beside the only array or the frames of a sequence, or attribute of its group, that is called label
+    or the like; None where there is none, or several.
+    """
+    if source.place is not None:
+        return None
+    names = [name for name in arrays if name.rpartition("/")[0] == source.group and says_label(name)]
+    found = {name: arrays[name][()] for name in names if _is_single(arrays[name])}
+    attributes = attributes_of(arrays[source.keys[0]], above=source.have_groups)
+    found = found or {name: one for name, one in attributes.items() if says_label(name)}
+    values = [np.asarray(one) for one in found.values()]
+    return values[0].item() if len(values) == 1 and values[0].size == 1 and values[0].dtype.kind in "uif" else None
 
 
 def says_label(name: str) -> bool:

@@ -87,10 +87,14 @@ def told_units(array: Any) -> str:
     return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
 
 
-def attributes_of(array: Any) -> Mapping[str, Any]:
-    """Returns the attributes of an HDF5 data set, and of its group where it has none of a name; none of other arrays."""
+def attributes_of(array: Any, *, above: bool = False) -> Mapping[str, Any]:
+    """Returns the attributes of an HDF5 data set, and of its group where it has none of a name; none of other arrays. above: only
+    those of the group that holds its group.
+    """
     dataset = getattr(array, "_dataset", array)
-    return {**dataset.parent.attrs, **dataset.attrs} if hasattr(dataset, "attrs") else {}
+    if not hasattr(dataset, "parent"):
+        return {}
+    return dict(dataset.parent.parent.attrs) if above else {**dataset.parent.attrs, **dataset.attrs}
 
 
 def _attribute(dataset: Any, name: str, default: float) -> float:

@@ -21,6 +21,7 @@ from dpcli.prepare.array_files.choosing import (
     Source,
     beside_frames,
     find_beside,
+    find_label,
     find_sources,
     find_times_of_groups,
     says_label,
@@ -133,12 +134,13 @@ class ArraySequences(OwnScans):
             try:
                 with open_arrays(path) as arrays:
                     sources = find_sources(arrays, self.axes) or _refuse(path, arrays, self.axes)
+                    labels = [find_label(arrays, own) for own in sources]
             except DataError as error:
                 items.append(Item(name, path, problem=str(error)))
                 continue
             items += [
-                Item(f"{name}/{as_utf8(own.name)}" if own.name else name, path, extra={"source": own})
-                for own in sources
+                Item(f"{name}/{as_utf8(own.name)}" if own.name else name, path, extra={"source": own, "label": label})
+                for own, label in zip(sources, labels)
             ]
         return items
 
@@ -194,27 +196,30 @@ class ArraySequences(OwnScans):
         return self._labels_inside()
 
     def _labels_inside(self) -> LabelTable | None:
-        """Returns the labels that files with many sequences each hold beside them, whole numbers from 0; None without them."""
+        """Returns the labels that files hold beside each sequence, or beside many, whole numbers from 0; None without them."""
         rows: dict[str, Row] = {}
         for path in self._paths.values():
             own = [item for item in self._items if item.path == path and not item.problem]
-            if not own or own[0].extra["source"].place is None:
-                return None
-            with open_arrays(path) as arrays:
-                try:
-                    beside, _ = self._beside(path, arrays, own[0].extra["source"])
-                except DataError:
-                    return None
-                values = np.asarray(arrays[beside.labels][()]).reshape(-1) if beside.labels else np.zeros(0)
+            if not own:
+                continue
+            values = np.array([item.extra["label"] for item in own if item.extra["label"] is not None])
+            if own[0].extra["source"].place is not None:
+                with open_arrays(path) as arrays:
+                    try:
+                        beside, _ = self._beside(path, arrays, own[0].extra["source"])
+                    except DataError:
+                        return None
+                    values = np.asarray(arrays[beside.labels][()]).reshape(-1) if beside.labels else np.zeros(0)
             if (
                 len(values) != len(own)
                 or (values != np.floor(values)).any()
                 or values.min() < -1  # of those that nobody knows
-                or values.max() < 0
                 or values.max() > _MOST_CLASSES
             ):
                 return None
             rows |= {item.name: Row(int(label), -1, "") for item, label in zip(own, values)}
+        if max((row.label for row in rows.values()), default=-1) < 0:
+            return None
         return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
 
     def items(self) -> list[Item]:
@@ -314,6 +319,9 @@ class ArraySequences(OwnScans):
                     beside = [name for name in beside if not says_times(name)]
                 if self._table is None or self.labels or self.label_from_folder:
                     beside = [name for name in beside if not says_label(name)]
+                if self._table is not None and source.place is None and not (self.labels or self.label_from_folder):
+                    groups = {own.group for own in sources}
+                    beside += [name for name in arrays if says_label(name) and name.rpartition("/")[0] in groups]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]

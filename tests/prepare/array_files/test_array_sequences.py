@@ -376,3 +376,41 @@ def test_labels_that_are_not_used_are_named_and_minus_one_is_unknown(tmp_path):
         reader = ArraySequences(tmp_path / "a.npz")
         items = reader.items()
         assert {item.label for item in items} == {-1} and "not read: y" in reader.summary(items)[0]
+
+
+@pytest.mark.parametrize("form", ["npz", "number", "attribute", "groups", "attributes of groups", "numbered frames"])
+def test_one_label_beside_each_sequence_is_its_own(tmp_path, form):
+    """In the file of each, or in the group of each, as a number or as an attribute."""
+    labels = [2, 0, -1]
+    (tmp_path / "in").mkdir()
+    for place, (own, label) in enumerate(zip(BATCH, labels)):
+        path, group = tmp_path / "in" / f"walk_{place}.h5", ""
+        if form == "npz":
+            np.savez(path.with_suffix(".npz"), points=own, label=label)
+            continue
+        if form not in ("number", "attribute"):
+            path, group = path.with_name("all.h5"), f"walk_{place}/"
+        with h5py.File(path, "a") as file:
+            if form == "numbered frames":
+                file.update({f"{group}{t}/points": cloud for t, cloud in enumerate(own)})
+            else:
+                file[f"{group}points"] = own
+            if form in ("number", "groups"):
+                file[f"{group}y"] = label
+            else:
+                file[group or "/"].attrs["label"] = label
+    reader = ArraySequences(tmp_path / "in")
+    items = reader.items()
+    assert [item.label for item in items] == labels and "not read" not in reader.summary(items)[0]
+    samples = [reader.read(item, np.random.default_rng(0)).sequence for item in items]
+    assert [one.label for one in samples] == labels and np.allclose(
+        samples[1].points, BATCH[1].reshape(-1, 3), atol=1e-6
+    )
+
+
+def test_labels_that_some_sequences_lack_are_not_used_but_named(tmp_path):
+    np.savez(tmp_path / "a.npz", points=BATCH[0], label=1)
+    np.savez(tmp_path / "b.npz", points=BATCH[1])
+    reader = ArraySequences(tmp_path)
+    items = reader.items()
+    assert {item.label for item in items} == {-1} and "not read: label" in reader.summary(items)[0]
