@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickletools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,11 @@ class ArrayTable:
         self.path = path
         ((self._columns, self._units),) = found.values()
         self.names = tuple(self._columns)
-        units = {unit_of_comments([f"units: {self._units[name]}"]) for name in self.names if name in self._units} - {""}
+        axes: list[int] = []
+        with suppress(DataError):  # reading says which names could be the same
+            axes, _ = find_axes(self.names) or (axes, "")
+        about = [self._units.get(name, "") for name in ("", *(self.names[place] for place in axes))]
+        units = {unit_of_comments([f"units: {told}"]) for told in about} - {""}
         self.unit = units.pop() if len(units) == 1 else ""
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
@@ -103,7 +108,7 @@ def _read_once(path: Path, _size: int, _changed: int) -> dict[str, tuple[Columns
     found = {}
     for name, (table, kinds) in read_tables(path).items():
         columns = _columns_of(table, kinds)
-        found |= {name: (columns, {})} if _are_points(columns) else {}
+        found |= {name: (columns, {"": str(kinds.get("units", ""))})} if _are_points(columns) else {}
     return found or _side_by_side(path)
 
 
@@ -111,7 +116,7 @@ def _columns_of(table: Mapping[str, np.ndarray], kinds: Mapping[str, Any]) -> Co
     """Returns the columns of one table; those of several numbers a row by the names that pandas tells, or numbered."""
     found: Columns = {}
     for name, values in table.items():
-        values = values.reshape(len(values), -1)
+        values = values.reshape(len(values), int(np.prod(values.shape[1:])))
         names = _names_of_block(kinds.get(f"{name}_kind")) if name.startswith("values_block_") else [name]
         if len(names) != values.shape[1]:
             names = _spread(name, values.shape[1])

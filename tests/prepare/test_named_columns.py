@@ -160,3 +160,15 @@ def test_several_tables_are_named(tmp_path):
         file["one"], file["other"] = structured(), structured()
     run = told("prepare", "clouds", tmp_path / "a.h5", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
     assert run.returncode == 3 and "one, other" in run.stderr
+
+
+def test_a_unit_of_a_whole_table_counts_and_an_empty_one_is_said_to_be(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["log"] = structured()
+        file["log"].attrs["units"] = "mm"
+    reader = TableSequences(tmp_path / "a.h5")
+    sample = reader.read(reader.items()[0], np.random.default_rng(0)).sequence
+    assert np.allclose(sample.points[:, 2], COLUMNS["z"] / 1000)
+    np.save(tmp_path / "b.npy", structured()[:0])
+    run = told("prepare", "clouds", tmp_path / "b.npy", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert run.returncode == 3 and "a table without rows" in run.stderr
