@@ -268,13 +268,17 @@ def _is_single(array: Any) -> bool:
     return hasattr(array, "shape") and array.ndim <= 2 and np.prod(array.shape) == 1
 
 
-def find_label(arrays: Mapping[str, Any], source: Source) -> float | None:
-    """Returns the one number beside the only array or the frames of a sequence, or attribute of its group, that is called label
-    or the like; None where there is none, or several.
+def find_labels(arrays: Mapping[str, Any], sources: Sequence[Source]) -> list[float | None]:
+    """Returns, for each sequence, the one number beside its only array or its frames, or attribute of its group, that is called
+    label or the like; None where there is none, or several.
     """
-    if source.place is not None:
-        return None
-    names = [name for name in arrays if name.rpartition("/")[0] == source.group and says_label(name)]
+    beside: dict[str, list[str]] = {}
+    for name in filter(says_label, arrays):
+        beside.setdefault(name.rpartition("/")[0], []).append(name)
+    return [_label(arrays, own, beside.get(own.group, [])) if own.place is None else None for own in sources]
+
+
+def _label(arrays: Mapping[str, Any], source: Source, names: Sequence[str]) -> float | None:
     found = {name: arrays[name][()] for name in names if _is_single(arrays[name])}
     attributes = attributes_of(arrays[source.keys[0]], above=source.have_groups)
     found = found or {name: one for name, one in attributes.items() if says_label(name)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,7 +94,17 @@ def attributes_of(array: Any, *, above: bool = False) -> Mapping[str, Any]:
     dataset = getattr(array, "_dataset", array)
     if not hasattr(dataset, "parent"):
         return {}
-    return dict(dataset.parent.parent.attrs) if above else {**dataset.parent.attrs, **dataset.attrs}
+    return _read_attributes(dataset.parent.parent if above else dataset.parent, *([] if above else [dataset]))
+
+
+def _read_attributes(*holders: Any) -> dict[str, Any]:
+    """Returns the attributes of groups and data sets, those of the last first; without those whose type h5py can't read."""
+    found = {}
+    for holder in holders:
+        for name in holder.attrs:
+            with suppress(TypeError, ValueError, OSError):
+                found[name] = holder.attrs[name]
+    return found
 
 
 def _attribute(dataset: Any, name: str, default: float) -> float:

@@ -21,7 +21,7 @@ from dpcli.prepare.array_files.choosing import (
     Source,
     beside_frames,
     find_beside,
-    find_label,
+    find_labels,
     find_sources,
     find_times_of_groups,
     says_label,
@@ -134,7 +134,7 @@ class ArraySequences(OwnScans):
             try:
                 with open_arrays(path) as arrays:
                     sources = find_sources(arrays, self.axes) or _refuse(path, arrays, self.axes)
-                    labels = [find_label(arrays, own) for own in sources]
+                    labels = find_labels(arrays, sources)
             except DataError as error:
                 items.append(Item(name, path, problem=str(error)))
                 continue
