@@ -103,7 +103,7 @@ class Series:
         if fps is None:
             return self.times()
         numbers = None if self.name_times() is not None and not self._is_counted() else self.numbers()
-        places = np.arange(len(self.names)) if numbers is None else _evenly(numbers)
+        places = np.arange(len(self.names)) if numbers is None else evenly(numbers)
         return places / fps
 
 
@@ -194,7 +194,7 @@ def _moments(clips: Sequence[Series]) -> str:
     )
 
 
-def _evenly(numbers: np.ndarray) -> np.ndarray:
+def evenly(numbers: np.ndarray) -> np.ndarray:
     """Returns how many steps each number is behind the first; a common step of 2 or more counts as one."""
     return (numbers - numbers[0]) // max(int(np.gcd.reduce(np.diff(numbers))), 1) if len(numbers) > 1 else numbers * 0
 

@@ -1,7 +1,8 @@
-"""Times of frames that a text beside them lists, a row each, as KITTI has them."""
+"""Times of frames that lie beside them: in a text, a row each, as KITTI has them, or in an array of the same file."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +42,21 @@ def with_times(series: Series, root: Path) -> Series:
         )
         return replace(series, left_out=(*others, f"{path.name} ({told})"))
     return series
+
+
+def seconds_beside(name: str, values: np.ndarray, units: str = "") -> np.ndarray | None:
+    """Returns seconds since the first, f64 (T), of numbers that an array beside frames holds, in the unit that its name or its
+    attribute ``units`` says; None where they don't rise, or the unit isn't known.
+    """
+    values = np.asarray(values).reshape(-1)
+    if values.dtype.kind == "M":
+        since = (values - values[:1]) / np.timedelta64(1, "s")
+    else:
+        values, name = values.astype(np.float64), f"time {name.rpartition('/')[2]}"  # whatever else it is called
+        unit = re.match(r"[^\W\d]+", units)
+        since = values - values[:1]
+        since *= seconds_of(f"{name} [{unit[0]}]" if unit else name, values) if len(values) else 1
+    return since if len(since) < 2 or (np.diff(since) > 0).all() else None
 
 
 def _seconds(path: Path) -> np.ndarray:

@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, one_unit, unit_of, words_of
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, delimiter_of, names_in
+from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.scans.frames_of_tables import Rows
 from dpcli.text_files import decode_text
 
@@ -37,7 +39,7 @@ class WideTable:
     coordinates, "" where nothing tells it; missing: how many rows fewer there are than the lines above the names count.
     """
 
-    table: TextTable | ParquetTable
+    table: TextTable | ParquetTable | ArrayTable
     trios: np.ndarray
     unit: str
     missing: int = 0
@@ -76,8 +78,8 @@ def read_wide(path: Path) -> WideTable:
 
     Raises DataError where fewer than two points are found in its columns.
     """
-    if path.suffix.lower() in COLUMNAR:
-        columnar = ParquetTable(path)
+    if path.suffix.lower() in (*COLUMNAR, *SUFFIXES):
+        columnar = ParquetTable(path) if path.suffix.lower() in COLUMNAR else ArrayTable(path)
         return _checked(path, columnar, [[name] for name in columnar.names], "")
     lines = decode_text(path).split("\n")
     head = [names_in(line.strip(" \r\0"), None) for line in lines[:_LOOKED_AT]]
@@ -111,8 +113,8 @@ def hint(path: Path, error: DataError) -> DataError:
     return error if ROWS_ARE_FRAMES in str(error) else DataError(f"{error}; {ROWS_ARE_FRAMES}")
 
 
-def _checked(path: Path, table: TextTable | ParquetTable, told: list[list[str]], unit: str) -> WideTable:
-    trios = _trios([[name] for name in table.names] if isinstance(table, ParquetTable) else told)
+def _checked(path: Path, table: TextTable | ParquetTable | ArrayTable, told: list[list[str]], unit: str) -> WideTable:
+    trios = _trios([[name] for name in table.names] if not isinstance(table, TextTable) else told)
     if len(trios) < 2:
         raise DataError(f"{path}: --track columns: {len(trios)} points in the columns; expected two or more")
     if isinstance(table, TextTable) and not table.first_rows(1):

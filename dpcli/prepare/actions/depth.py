@@ -33,6 +33,7 @@ from dpcli.prepare.decode.depth_files import (
     frame_series,
     read_depth_video,
     require_depth,
+    tells_times,
 )
 from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -318,7 +319,7 @@ def _tells_time(item: Item) -> bool:
     """Returns whether an item says when its frames were taken: by time stamps inside, or by the names of its frames."""
     series: Series | None = item.extra["series"]
     stamped = item.extra["recording"] or item.path.suffix.lower() in VIDEO_SUFFIXES
-    return series.times() is not None if series else stamped
+    return series.times() is not None if series else stamped or tells_times(item.path)
 
 
 def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,8 @@ _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
+PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
+_names: dict[tuple[Path, int, int], dict[str, str]] = {}  # arrays in the HDF5 file opened last, and where they lie
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -75,6 +77,35 @@ class Unreadable:
 
     def __getitem__(self, key: Any) -> np.ndarray:
         raise self._error
+
+
+def told_units(array: Any) -> str:
+    """Returns what the attribute ``units`` or ``unit`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05"; ""
+    without one.
+    """
+    attributes = getattr(array, "attrs", {})
+    told = np.ravel(attributes.get("units", attributes.get("unit", ""))).tolist()
+    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
+
+
+def attributes_of(array: Any, *, above: bool = False) -> Mapping[str, Any]:
+    """Returns the attributes of an HDF5 data set, and of its group where it has none of a name; none of other arrays. above: only
+    those of the group that holds its group.
+    """
+    dataset = getattr(array, "_dataset", array)
+    if not hasattr(dataset, "parent"):
+        return {}
+    return _read_attributes(dataset.parent.parent if above else dataset.parent, *([] if above else [dataset]))
+
+
+def _read_attributes(*holders: Any) -> dict[str, Any]:
+    """Returns the attributes of groups and data sets, those of the last first; without those whose type h5py can't read."""
+    found = {}
+    for holder in holders:
+        for name in holder.attrs:
+            with suppress(TypeError, ValueError, OSError):
+                found[name] = holder.attrs[name]
+    return found
 
 
 def _attribute(dataset: Any, name: str, default: float) -> float:
@@ -136,12 +167,61 @@ def tables_inside(path: Path) -> list[str]:
     found: list[str] = []
 
     def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            _require_type(item, path)
         if "pandas_type" in item.attrs if isinstance(item, h5py.Group) else item.dtype.names:
             found.append(name)
 
     with reading(path), h5py.File(path, "r") as file:
         file.visititems(note)
     return [name for name in found if not any(name.startswith(f"{other}/") for other in found)]
+
+
+def read_tables(path: Path) -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    """Returns the tables of `tables_inside` by name: their columns (N, or N and several) as stored, and their attributes."""
+    names = tables_inside(path)
+    if not names or not is_hdf5(path):
+        arrays = _read_all(path, path.stat().st_size, path.stat().st_mtime_ns) if names else {}
+        flat = {name: np.asarray(arrays[name]).reshape(-1) for name in names}
+        return {name: ({own: one[own] for own in one.dtype.names or ()}, {}) for name, one in flat.items()}
+    with reading(path), _hdf5_of_others(path) as file:
+        return {name: _table_of(file[name], path) for name in names}
+
+
+def _table_of(item: Any, path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Returns columns and attributes of a data set of a compound type, or of a group of pandas, whose kinds are ``table`` and
+    ``fixed``.
+    """
+    import h5py
+
+    if isinstance(item, h5py.Dataset) or "table" in item:
+        rows = item if isinstance(item, h5py.Dataset) else item["table"]
+        values = _checked(rows, path)[()].reshape(-1)
+        return {name: values[name] for name in values.dtype.names}, dict(rows.attrs)
+    found, about = {}, {}
+    for place in range(len(item)):
+        if f"block{place}_items" in item:
+            names = [str(one, "utf-8", "replace") for one in _checked(item[f"block{place}_items"], path)[()].tolist()]
+            values = _checked(item[f"block{place}_values"], path)[()]
+            if values.ndim == 2 and values.shape[1] == len(names):  # texts are a pickle
+                found |= dict(zip(names, values.T))
+                about |= {f"{name}_dtype": item[f"block{place}_values"].attrs.get("value_type", "") for name in names}
+    index = item.get("axis1")
+    if index is not None and index.dtype.kind in "uif" and found:
+        name = str(np.asarray(index.attrs.get("name", b"N.")).astype(str))
+        found = {"index" if name == "N." else name: _checked(index, path)[()], **found}  # a pickle of None
+    return found, about
+
+
+def _checked(item: h5py.Dataset, path: Path) -> h5py.Dataset:
+    """Returns a data set. Raises DataError where its bytes are missing, elsewhere, or packed by a filter that is missing."""
+    if item.is_virtual or item.external:
+        raise DataError(f"{path}: {item.name} keeps its data in another file; copy them into one (h5repack)")
+    from dpcli.store.file import refuse_claim
+
+    refuse_claim(item, path)
+    _refuse_filters(item, path)
+    return item
 
 
 def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
@@ -152,6 +232,9 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
     if is_hdf5(path):
         with reading(path), h5py.File(path, "r") as file:
             names = [name for name, item in _datasets(file, path) if not _is_bare_dimension(item)]
+            links: list[tuple[str, Any]] = []
+            file.visititems_links(lambda name, link: links.append((name, link)))
+            names += [f"{name} (in {link.filename})" for name, link in links if isinstance(link, h5py.ExternalLink)]
     elif path.suffix.lower() == ".npz":
         with reading(path), open_archive(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -159,10 +242,9 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
 
 
 @contextmanager
-def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+def _hdf5_of_others(path: Path) -> Iterator[h5py.File]:
     import h5py
 
-    from dpcli.store.file import refuse_claim
     from dpcli.store.heap_check import check_heaps
 
     check_heaps(path)
@@ -171,23 +253,82 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             raise DataError(
                 f"{path}: dpc made it; `dpc info {path}` says what it holds, and what comes next reads it as it is"
             )
-        matlab = path.suffix.lower() == ".mat"
-        found: dict[str, Array | list[np.ndarray]] = {}
-        for name, item in _datasets(file, path):
-            if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
-                refuse_claim(item, path)
-                found |= {name: cells} if (cells := _cells(file, item, path)) else {}
-            elif item.dtype.kind in "uifb" and item.ndim and not _is_bare_dimension(item):
-                try:
-                    refuse_claim(item, path)
-                    _refuse_filters(item, path)
-                except DataError as error:
-                    found[name] = Unreadable(item, error)
-                    continue
-                scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
-                marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
-                found[name] = Reversed(item) if matlab else Unpacked(item, scaled) if scaled or marked else item
-        yield found
+        yield file
+
+
+@contextmanager
+def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
+    facts = path.stat()
+    state = path, facts.st_size, facts.st_mtime_ns
+    with _hdf5_of_others(path) as file:
+        if state not in _names:
+            items = dict(_datasets(file, path))
+            shown = {name: _shown(file, item, path) for name, item in items.items()}
+            found = {name: array for name, array in shown.items() if array is not None}
+            _names.clear()  # of the file before
+            _names[state] = {name: items[name].name for name in found}
+        else:
+            found = {}
+        names = _names[state]
+        yield _ByName(names, lambda name: _shown(file, file[names[name]], path), found)
+
+
+class _ByName(Mapping[str, Any]):
+    """Opens the arrays of a file whose names are known as they are asked for: sequences are read one by one from files with
+    thousands of arrays.
+    """
+
+    def __init__(self, names: Mapping[str, str], show: Callable[[str], Any], found: dict[str, Any]) -> None:
+        self._names, self._show, self._found = names, show, found
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._found:
+            if name not in self._names:
+                raise KeyError(name)
+            self._found[name] = self._show(name)
+        return self._found[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.ndarray] | None:
+    """Returns a data set as its numbers are meant, the list of a MATLAB cell; None of anything else."""
+    import h5py
+
+    from dpcli.store.file import refuse_claim
+
+    if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
+        refuse_claim(item, path)
+        return _cells(file, item, path) or None
+    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item):
+        return None
+    try:
+        refuse_claim(item, path)
+        _refuse_filters(item, path)
+    except DataError as error:
+        return Unreadable(item, error)
+    if path.suffix.lower() == ".mat":
+        return Reversed(item)
+    scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
+    marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
+    return Unpacked(item, scaled) if scaled or marked else item
+
+
+def _require_type(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError for a data set of a type that h5py has no numbers for, such as PyTables' times."""
+    try:
+        _ = item.dtype
+    except TypeError as error:
+        raise DataError(
+            f"{path}: {item.name} is of a type that isn't read ({error}); write it without, such as times as Float64Col"
+        ) from None
 
 
 def _is_bare_dimension(item: h5py.Dataset) -> bool:
@@ -216,12 +357,14 @@ def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
     import h5py
 
     found: list[tuple[str, h5py.Dataset]] = []
-    of_octave = {name for name, item in file.items() if _OCTAVE in item.attrs}
+    own = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+    of_octave = {name for name in own if _OCTAVE in file[name].attrs}
 
     def note(name: str, item: Any) -> None:
         if len(found) > _MOST:
             raise DataError(f"{path}: holds more than {_MOST} data sets; join those of one sequence")
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # #refs#, the contents of MATLAB's cells
+            _require_type(item, path)
             if item.is_virtual or item.external:
                 raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
             own = _name_in_octave(name) if name.split("/")[0] in of_octave else name
@@ -269,7 +412,11 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
         arrays = {one.filename[: -len(".npy")]: _member(path, archive.read(one)) for one in members}
-    return {name: array for name, array in arrays.items() if isinstance(array, list) or array.dtype.kind in "uifb"}
+    return {
+        name: array
+        for name, array in arrays.items()
+        if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names
+    }
 
 
 def _npy(path: Path) -> np.ndarray | list[np.ndarray]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.array_files.containers import Unreadable, open_arrays
+from dpcli.prepare.array_files.containers import PACKING, Unreadable, attributes_of, open_arrays, told_units
 
 # names that say depth, and not a picture of it or what lies beside it
 DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
@@ -61,8 +63,21 @@ def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
         )
 
 
-def archived_depth(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Returns the array of a file that is called depth, or the only one of two or three dimensions, and the small others."""
+@dataclass(frozen=True)
+class ArchivedDepth:
+    """Holds the depth of a file of named arrays, and what lies beside it. small: arrays that may tell of the camera or of times, by
+    name, of which ``units`` has what their attributes say; large: the names of other arrays; attributes: those of HDF5's depth.
+    """
+
+    depth: np.ndarray
+    small: dict[str, np.ndarray]
+    units: dict[str, str]
+    large: tuple[str, ...]
+    attributes: dict[str, np.ndarray]
+
+
+def archived_depth(path: Path) -> ArchivedDepth:
+    """Reads the array of a file that is called depth, or the only one of two or three dimensions."""
     with open_arrays(path) as opened:
         arrays = {name: one for name, one in opened.items() if not isinstance(one, list)}
         shaped = [k for k, v in arrays.items() if v.ndim in (2, 3) and 1 not in v.shape[:2] and v.dtype.kind in "uif"]
@@ -71,11 +86,25 @@ def archived_depth(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         chosen = next((choice[0] for choice in (called, plainly, shaped) if len(choice) == 1), None)
         if chosen is None:
             raise DataError(f"{path}: arrays {first_names(list(arrays), 8) or 'none'}; expected one called depth")
-        others = {name: one for name, one in arrays.items() if name != chosen}
         depth = np.asarray(arrays[chosen][()])
         depth = _of_matlab(path, depth) if path.suffix.lower() == ".mat" else depth
-        small = {name: one for name, one in others.items() if np.prod(one.shape) <= _SMALL}
-        return depth, {name: np.asarray(one[()]) for name, one in small.items() if not isinstance(one, Unreadable)}
+        others = {k: one for k, one in arrays.items() if k != chosen and not isinstance(one, Unreadable)}
+        small = {name: np.asarray(one[()]) for name, one in others.items() if np.prod(one.shape) <= _SMALL}
+        units = {name: told_units(others[name]) for name in small}
+        return ArchivedDepth(
+            depth,
+            small,
+            units,
+            tuple(name for name in others if name not in small),
+            _told_by_attributes(arrays[chosen]),
+        )
+
+
+def _told_by_attributes(array: Any) -> dict[str, np.ndarray]:
+    """Returns the numbers among the attributes of HDF5's depth and of its group, and the text that tells its units."""
+    found = {name: np.asarray(one) for name, one in attributes_of(array).items() if name not in PACKING}
+    found = {name: one for name, one in found.items() if one.dtype.kind in "uif" and one.size}
+    return found | ({"units": np.array(told_units(array))} if told_units(array) else {})
 
 
 def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     unnamed_columns,
     without,
 )
+from dpcli.prepare.cloud_formats.column_names import find_frame_column
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -42,7 +43,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 
 def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
-    """Reads a MATLAB file of one cloud as `read_npz` reads its arrays."""
+    """Reads a MATLAB or HDF5 file of one cloud as `read_npz` reads its arrays."""
     with open_arrays(path) as arrays:
         plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
     return _cloud_of_arrays(
@@ -55,6 +56,7 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
     if key is None and {"x", "y", "z"} <= arrays.keys():
         shape = arrays["x"].shape  # perhaps rows and columns of a grid
         alike = {k: a.reshape(-1) for k, a in arrays.items() if a.shape == shape}
+        _refuse_frames(path, alike)
         cloud = cloud_of_columns(path, alike, keep)
         cloud.unread += without(list(arrays), alike)
         return cloud
@@ -69,12 +71,23 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
         cloud.color = color[:, :3]
     shapes = ((rows,), (rows, 1))  # the second as Open3D writes attributes
     columns = {name: one.reshape(-1) for name, one in arrays.items() if one.shape in shapes}
+    _refuse_frames(path, columns)
     missing = [name for name in keep if name not in columns]
     if missing:
         raise DataError(f"{path}: column {missing[0]}: no such array of one number a point")
     cloud.extra = kept_columns(path, columns, keep)
     cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud
+
+
+def _refuse_frames(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Raises DataError where a column numbers several frames, which one cloud would mix up, as that of a table would."""
+    name = find_frame_column(list(columns))
+    values = np.unique(columns[name]) if name and columns[name].dtype.kind in "uif" else np.zeros(0)
+    if len(values) > 1 and (values == np.floor(values)).all():
+        raise DataError(
+            f"{path}: its column {name!r} numbers {len(values)} frames; --frame-column {name} makes them a sequence"
+        )
 
 
 def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
@@ -89,6 +102,7 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
     if array.dtype.names:
         flat = array.reshape(-1)
         single = [name for name in array.dtype.names if array.dtype[name].shape in ((), (1,))]
+        _refuse_frames(path, {name: flat[name].reshape(-1) for name in single})
         cloud = cloud_of_columns(path, {name: flat[name].reshape(-1) for name in single}, keep)
         cloud.unread += without(array.dtype.names, single)
         return cloud

@@ -44,6 +44,7 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".e57": read_e57,
 }
 MESHES = (".obj", ".off")  # whose vertices are read where there is nothing else
+HDF5 = (".h5", ".hdf5")  # which are read where there is nothing else: what dpc makes may lie beside the clouds
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 
 
@@ -64,6 +65,8 @@ def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] =
 def _read(path: Path, bin_columns: int | None, keep: Sequence[str]) -> Cloud:
     if path.suffix.lower() in MESHES:
         return read_vertices(path, keep)
+    if path.suffix.lower() in HDF5:
+        return read_mat(path, keep)
     if path.suffix.lower() != ".bin":
         return _READERS[path.suffix.lower()](path, keep)
     if keep:

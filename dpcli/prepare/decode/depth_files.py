@@ -15,7 +15,10 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import utf8_path
-from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, archived_depth, depth_frames, says_depth
+from dpcli.prepare.array_files.choosing import says_times
+from dpcli.prepare.array_files.containers import open_arrays
+from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, ArchivedDepth, archived_depth, depth_frames, says_depth
+from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
@@ -401,16 +404,44 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
 
     Raises DataError of what is none, such as the poses of a camera.
     """
-    return depth_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else archived_depth(path)[0], stride)
+    return depth_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else archived_depth(path).depth, stride)
 
 
-def _told_beside(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Returns what the arrays beside those of depth tell, by the fields of a `DepthVideo`."""
+def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any]:
+    """Returns what the arrays beside those of so many frames of depth tell, and the attributes of these, by the fields of a
+    `DepthVideo`.
+    """
     from dpcli.prepare.decode.calibration import camera_of_arrays
+    from dpcli.prepare.times_beside import seconds_beside
 
-    camera, scale, unread = camera_of_arrays(path, arrays)
+    attributes = dict(found.attributes)
+    unit = unit_of_comments([f"units: {attributes.pop('units', '')}"])
+    if unit and found.depth.dtype.kind != "f":
+        attributes["depth_unit"] = np.array(unit)
+    clocks = [name for name, one in found.small.items() if says_times(name.rpartition("/")[2]) and one.size == frames]
+    times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
+    name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
+    try:
+        camera, scale, rest = camera_of_arrays(path, {**attributes, **found.small})
+    except DataError:
+        camera, scale, rest = camera_of_arrays(path, found.small)
+        rest += tuple(f"attribute {one}" for one in attributes)
+    unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
     notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
-    return {"camera": camera, "scale": scale, "notes": notes}
+    return {"camera": camera, "scale": scale, "notes": notes, "time": time}
+
+
+def tells_times(path: Path) -> bool:
+    """Returns whether an array beside the depth in a file of named arrays tells when each frame was taken."""
+    if path.suffix.lower() not in ARRAY_SUFFIXES[1:] or not path.is_file():
+        return False
+    try:
+        with open_arrays(path) as arrays:
+            if not any(says_times(name.rpartition("/")[2]) for name in arrays):
+                return False
+        return _read_file(path, 1).time is not None
+    except DataError:  # reading says so
+        return False
 
 
 def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
@@ -429,8 +460,8 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         turned = _tiff_tag(tiff, _ORIENTATION) not in (None, 1)  # which OpenCV does
         known = {WHITE_AT_ZERO: int(has_white_at_zero(tiff)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
-        told = _told_beside(first, archived_depth(first)[1]) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
-        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], **told)
+        told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
+        video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         try:
             video = _read_file(path, stride)
@@ -446,8 +477,13 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
 def _read_file(path: Path, stride: int) -> DepthVideo:
     """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
     if path.suffix.lower() in ARRAY_SUFFIXES[1:]:
-        array, others = archived_depth(path)
-        return DepthVideo(depth_frames(path, array, stride), **_told_beside(path, others))
+        found = archived_depth(path)
+        frames = depth_frames(path, found.depth)
+        told = _told_beside(path, found, len(frames))
+        time = told["time"]
+        return DepthVideo(
+            np.ascontiguousarray(frames[::stride]), **{**told, "time": None if time is None else time[::stride]}
+        )
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
     from dpcli.prepare.decode.video_streams import how_shown

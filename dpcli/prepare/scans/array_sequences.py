@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -17,8 +16,26 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
-from dpcli.prepare.array_files.choosing import Beside, Source, find_beside, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, others_inside, tables_inside
+from dpcli.prepare.array_files.choosing import (
+    Beside,
+    Source,
+    beside_frames,
+    find_beside,
+    find_labels,
+    find_sources,
+    find_times_of_groups,
+    says_label,
+    says_times,
+)
+from dpcli.prepare.array_files.containers import (
+    SUFFIXES,
+    attributes_of,
+    made_by_dpc,
+    open_arrays,
+    others_inside,
+    tables_inside,
+    told_units,
+)
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
@@ -26,10 +43,12 @@ from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import left_out_below
-from dpcli.prepare.scans.times_of_tables import seconds_of
 from dpcli.prepare.scans.tracked_points import identify, with_track
-from dpcli.prepare.series import TEXTS, is_beside, is_hidden
+from dpcli.prepare.series import TEXTS, evenly, is_beside, is_hidden, missing_numbers
+from dpcli.prepare.times_beside import seconds_beside
+from dpcli.runtime.clips.name_numbers import NumberColumns
 
+MORE_FRAMES = "frames behind the counts of their files dropped"
 UNCOUNTED = "points behind the counts, or outside the masks, of their files dropped"
 _MOST_CLASSES = 10_000
 _LOOKED_AT = 20  # files of a folder, of which the first good one tells
@@ -116,12 +135,13 @@ class ArraySequences(OwnScans):
             try:
                 with open_arrays(path) as arrays:
                     sources = find_sources(arrays, self.axes) or _refuse(path, arrays, self.axes)
+                    labels = find_labels(arrays, sources)
             except DataError as error:
                 items.append(Item(name, path, problem=str(error)))
                 continue
             items += [
-                Item(f"{name}/{as_utf8(own.name)}" if own.name else name, path, extra={"source": own})
-                for own in sources
+                Item(f"{name}/{as_utf8(own.name)}" if own.name else name, path, extra={"source": own, "label": label})
+                for own, label in zip(sources, labels)
             ]
         return items
 
@@ -140,14 +160,21 @@ class ArraySequences(OwnScans):
         source: Source = item.extra["source"]
         with open_arrays(item.path) as arrays:
             beside, axes = self._beside(item.path, arrays, source)
-            timed = self.fps is not None or (beside.times and _times(arrays, beside, axes, source) is not None)
+            timed = self.fps is not None or _times(item.path, arrays, beside, axes, source) is not None
             return bool(timed), bool(beside.colors)
 
     def _beside(self, path: Path, arrays: Mapping[str, Any], source: Source) -> tuple[Beside, str]:
         """Returns what lies beside the array of one sequence, and the letters of its axes, "" of lists and single frames."""
         array = arrays[source.keys[0]]
-        if isinstance(array, list) or len(source.keys) > 1 or array.ndim == 2:
-            return Beside(), ""
+        if isinstance(array, list) or len(source.keys) > 1:
+            beside = beside_frames(arrays, source)
+            if beside.labels and source.place is None and not self.axes:
+                count = len(source.keys) if len(source.keys) > 1 else len(array)
+                raise DataError(
+                    f"{path}: has a number in {beside.labels!r} for each of its {count} clouds; if these are the frames of one"
+                    " sequence, give --axes TNC, if each is a sample of its own, save it to a file in a folder of its own"
+                )
+            return beside, ""
         facts = path.stat()
         axes = self.axes or _axes(path, source.keys[0], facts.st_size, facts.st_mtime_ns)
         if not axes:
@@ -170,26 +197,30 @@ class ArraySequences(OwnScans):
         return self._labels_inside()
 
     def _labels_inside(self) -> LabelTable | None:
-        """Returns the labels that files with many sequences each hold beside them, whole numbers from 0; None without them."""
+        """Returns the labels that files hold beside each sequence, or beside many, whole numbers from 0; None without them."""
         rows: dict[str, Row] = {}
         for path in self._paths.values():
             own = [item for item in self._items if item.path == path and not item.problem]
-            if not own or own[0].extra["source"].place is None:
-                return None
-            with open_arrays(path) as arrays:
-                try:
-                    beside, _ = self._beside(path, arrays, own[0].extra["source"])
-                except DataError:
-                    return None
-                values = np.asarray(arrays[beside.labels][()]).reshape(-1) if beside.labels else np.zeros(0)
+            if not own:
+                continue
+            values = np.array([item.extra["label"] for item in own if item.extra["label"] is not None])
+            if own[0].extra["source"].place is not None:
+                with open_arrays(path) as arrays:
+                    try:
+                        beside, _ = self._beside(path, arrays, own[0].extra["source"])
+                    except DataError:
+                        return None
+                    values = np.asarray(arrays[beside.labels][()]).reshape(-1) if beside.labels else np.zeros(0)
             if (
                 len(values) != len(own)
                 or (values != np.floor(values)).any()
-                or values.min() < 0
+                or values.min() < -1  # of those that nobody knows
                 or values.max() > _MOST_CLASSES
             ):
                 return None
             rows |= {item.name: Row(int(label), -1, "") for item, label in zip(own, values)}
+        if max((row.label for row in rows.values()), default=-1) < 0:
+            return None
         return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
 
     def items(self) -> list[Item]:
@@ -211,15 +242,16 @@ class ArraySequences(OwnScans):
             kept = {
                 name: self._column(item.path, arrays, name, source, axes) for name in with_track(self.keep, self.track)
             }
-            time = _times(arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
-            real = _real_points(arrays, beside, axes, source, frames)
-            unit = unit_of_comments([f"units: {_told_units(arrays[source.keys[0]])}"])
+            time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
+            real = _real_points(item.path, arrays, beside, axes, source, frames)
+            unit = unit_of_comments([f"units: {told_units(arrays[source.keys[0]])}"])
+            wanted = _frame_count(item.path, arrays, beside, source, len(frames))
         if item.extra["time"] and time is None:
             if not self.fps:
                 raise DataError(
                     f"{item.path}: no array beside its clouds tells times that rise, though the first file has one"
                 )
-            time = np.arange(len(frames)) / self.fps
+            time = _at_rate(source, len(frames), self.fps)
         if item.extra["color"] and colors is None:
             raise DataError(f"{item.path}: no colors beside its clouds, though the first file has them")
         clouds = [
@@ -232,17 +264,18 @@ class ArraySequences(OwnScans):
             for t, frame in enumerate(frames)
         ]
         identify(item.path, clouds, self.track, self.keep)
-        dropped = sum(int(np.count_nonzero(~own)) for own in real)
+        dropped = sum(int(np.count_nonzero(~own)) for own in real[:wanted])
         for cloud, own in zip(clouds, real):
             cloud.keep(own)
-        clouds = clouds[:: self.stride]
+        more, clouds = len(clouds) - wanted, clouds[: wanted : self.stride]
         sample = assemble(
             item,
             clouds,
             Lengths(self.scale, self.unit),
             color=item.extra["color"],
-            time=None if time is None else time[:: self.stride],
+            time=None if time is None else time[: wanted : self.stride],
         )
+        sample.notes |= {MORE_FRAMES: more} if more else {}
         sample.notes |= {UNCOUNTED: dropped} if dropped else {}
         return sample
 
@@ -282,6 +315,15 @@ class ArraySequences(OwnScans):
                 keys = dict.fromkeys(key for own in sources for key in own.keys)
                 alike = [key for key in keys if axes and len(axes) == getattr(arrays[key], "ndim", 0)]
                 beside = [name for key in alike for name in find_beside(arrays, key, axes).named()]
+                for own in sources if not axes else ():
+                    beside += [*beside_frames(arrays, own).named(), *find_times_of_groups(arrays, own)]
+                if not self._first[0] or self.fps:  # what doesn't rise isn't read
+                    beside = [name for name in beside if not says_times(name)]
+                if self._table is None or self.labels or self.label_from_folder:
+                    beside = [name for name in beside if not says_label(name)]
+                if self._table is not None and source.place is None and not (self.labels or self.label_from_folder):
+                    groups = {own.group for own in sources}
+                    beside += [name for name in arrays if says_label(name) and name.rpartition("/")[0] in groups]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
                 first = arrays[source.keys[0]]
@@ -293,6 +335,8 @@ class ArraySequences(OwnScans):
         columns = shape[axes.index("C")] if axes else max(told, default=3)
         said = f"; shape {shape} taken as --axes {axes}" if axes and not self.axes else ""
         said += f"; {source.keys[0]} to {source.keys[-1]} taken as its frames" if len(source.keys) > 1 else ""
+        missing = missing_numbers(NumberColumns(source.counted).running_numbers()) if source.counted else []
+        said += f", without {first_names(missing, 5)}" if missing else ""
         said += f"; of each point the first 3 of {columns} numbers are read" if 3 < columns else ""
         return said + (f"; not read: {first_names(unread, 8)}" if unread else "")
 
@@ -321,7 +365,9 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
     wanted = (
         f"{len(axes)} axes (--axes {axes})" if axes else "shape (frames, points, 3) or (sequences, frames, points, 3)"
     )
-    raise DataError(f"{path}: holds {first_names(shapes, 5) or 'no arrays of numbers'}; expected an array of {wanted}")
+    others = "" if shapes else first_names(others_inside(path, arrays), 3)
+    held = first_names(shapes, 5) or f"no arrays of numbers{f', but {others}' if others else ''}"
+    raise DataError(f"{path}: holds {held}; expected an array of {wanted}")
 
 
 def _which(path: Path, shape: tuple[int, ...]) -> str:
@@ -364,12 +410,6 @@ def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) ->
     return [_as_points(one.T if by_columns else one) if one.size else np.zeros((0, 3), np.float32) for one in parts]
 
 
-def _told_units(array: Any) -> str:
-    """Returns what the attribute ``units`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05", "" without one."""
-    told = np.ravel(getattr(array, "attrs", {}).get("units", "")).tolist()
-    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
-
-
 def _as_points(array: np.ndarray) -> np.ndarray:
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
     return array[..., :3].astype(kind)
@@ -386,23 +426,62 @@ def _of_frames(array: Any, axes: str, shape: tuple[int, ...], place: int | None)
     )
 
 
-def _times(arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
-    """Returns seconds since the first frame, f64 (T), that an array tells; None where it tells none that rise."""
-    if not beside.times:
+def _at_rate(source: Source, count: int, fps: float) -> np.ndarray:
+    """Returns the seconds of frames, f64 (T), by their numbers where names tell them, so that what is missing leaves a gap."""
+    columns = NumberColumns(source.counted)
+    numbers = columns.running_numbers() if source.counted and columns.times() is None else None
+    return (np.arange(count) if numbers is None else evenly(numbers)) / fps
+
+
+def _times(path: Path, arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source) -> np.ndarray | None:
+    """Returns seconds since the first frame, f64 (T), that an array tells, or a number or an attribute of each frame, or the names
+    of these; None where nothing tells times that rise.
+    """
+    if beside.times:
+        array = arrays[beside.times]
+        values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place) if axes else np.asarray(array[()])
+        stop = _frame_count(path, arrays, beside, source, len(values))  # behind it may be anything
+        return seconds_beside(beside.times, values[:stop], told_units(array))
+    if len(source.keys) < 2:
         return None
-    array = arrays[beside.times]
-    values = _of_frames(array, axes, arrays[source.keys[0]].shape, source.place).astype(np.float64)
-    name, unit = beside.times.rpartition("/")[2], re.match(r"[^\W\d]+", _told_units(array))
-    since = (values - values[0]) * seconds_of(f"{name} [{unit[0]}]" if unit else name, values)
-    return since if len(since) < 2 or (np.diff(since) > 0).all() else None
+    if names := find_times_of_groups(arrays, source):
+        values = np.array([np.asarray(arrays[name][()]).item() for name in names])
+        return seconds_beside(names[0], values, told_units(arrays[names[0]]))
+    told = [attributes_of(arrays[key]) for key in source.keys]
+    for name in filter(says_times, told[0]):
+        values = [np.asarray(one.get(name, "")) for one in told]
+        if all(one.size == 1 and one.dtype.kind in "uif" for one in values):
+            return seconds_beside(name, np.array([one.item() for one in values]))
+    return NumberColumns(source.counted).times()
+
+
+def _frame_count(path: Path, arrays: Mapping[str, Any], beside: Beside, source: Source, stored: int) -> int:
+    """Returns how many frames of a sequence are no padding, by the counts beside them. Raises DataError where it can't be."""
+    if not beside.frames:
+        return stored
+    told = float(np.asarray(arrays[beside.frames][()]).reshape(-1)[source.place])
+    if not 1 <= told <= stored or told != int(told):
+        raise DataError(
+            f"{path}: {beside.frames!r} tells {told:g} frames of a sequence that has {stored}; expected 1 to {stored}"
+        )
+    return int(told)
 
 
 def _real_points(
-    arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source, frames: list[np.ndarray]
+    path: Path, arrays: Mapping[str, Any], beside: Beside, axes: str, source: Source, frames: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Returns which points of each frame are no padding, by the counts or the mask beside them: bool (N) each."""
+    """Returns which points of each frame are no padding, by the counts or the mask beside them: bool (N) each. Raises DataError
+    where a mask holds more than two values, such as the numbers of objects.
+    """
     if beside.mask:
-        return list(_cut(arrays[beside.mask], axes.replace("C", ""), source.place) != 0)
+        own = axes if arrays[beside.mask].ndim == len(axes) else axes.replace("C", "")
+        mask = _cut(arrays[beside.mask], own, source.place).reshape(len(frames), -1)
+        if len(values := np.unique(mask)) > 2:
+            raise DataError(
+                f"{path}: {beside.mask!r} holds {len(values)} different numbers, expected two: points that are valid and others;"
+                " call it otherwise if it is no mask"
+            )
+        return list(mask != 0)
     if beside.counts:
         counts = _of_frames(arrays[beside.counts], axes, arrays[source.keys[0]].shape, source.place)
         return [np.arange(len(frame)) < count for frame, count in zip(frames, counts)]

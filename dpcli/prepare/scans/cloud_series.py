@@ -13,7 +13,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.decode.cloud_files import MESHES
+from dpcli.prepare.decode.cloud_files import HDF5, MESHES
 from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_beside, is_hidden
@@ -87,8 +87,9 @@ def find_sequences(
     if not found:
         others = Counter({suffix: count for suffix, count in foreigners.items() if suffix not in _NOTES})
         others = others or Counter({suffix: count for suffix, count in foreigners.items() if suffix in _ADVICE})
-        if any(others[suffix] for suffix in MESHES) and tuple(suffixes) != MESHES:
-            return find_sequences(root, MESHES, pattern=pattern, table=table)
+        for last in (MESHES, HDF5):
+            if any(others[suffix] for suffix in last) and tuple(suffixes) not in (MESHES, HDF5):
+                return find_sequences(root, last, pattern=pattern, table=table)
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: {_advice(others)}" if others else _of_pictures(root)
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")

@@ -109,6 +109,8 @@ def split_rows(table: Table, column: str, sequence_column: str = "", gap: float 
     is not there, or that holds nothing in some row.
     """
     frames, numbers, clock = _frame_values(table, column)
+    if not len(frames):
+        raise DataError(f"{table.path}: a table without rows; expected numbers in columns")
     if gap is not None and numbers is None:
         raise DataError(f"{table.path}: --gap needs numbers in {column!r}; it holds words such as {frames[0]!r}")
     groups = _groups(table, sequence_column, len(frames))

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
-from dpcli.prepare.array_files.containers import SUFFIXES
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
@@ -26,6 +26,7 @@ from dpcli.prepare.cloud_formats.text_cloud import EMPTY, cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
+from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import left_out_below, refuse_file
@@ -72,22 +73,19 @@ class TableSequences(OwnScans):
     @cached_property
     def _paths(self) -> dict[str, Path]:
         """Returns the tables by the names of their sequences."""
-        if self.raw.is_file() and self.raw.suffix.lower() in SUFFIXES:
-            raise DataError(
-                f"{self.raw}: a file of arrays; the options of tables (--frame-column and the like) need it as .csv or .parquet."
-                " Arrays of clouds are read without them"
-            )
-        refuse_file(self.raw, ())
+        if self.raw.suffix.lower() not in SUFFIXES:
+            refuse_file(self.raw, ())
         if self.raw.is_file():
             return {as_utf8(self.raw.stem): self.raw}
         if not self.raw.is_dir():
             raise DataError(
-                f"{self.raw}: does not exist; expected a table ({', '.join(TABLES)}), or a folder of tables"
+                f"{self.raw}: does not exist; expected a table ({', '.join((*TABLES, *SUFFIXES))}), or a folder of tables"
             )
         labels = self.labels.resolve() if self.labels else None
-        found = [path for path in _tables_below(self.raw) if path.resolve() != labels]
+        found = [path for path in _tables_below(self.raw, TABLES) if path.resolve() != labels]
+        found = found or [path for path in _tables_below(self.raw, SUFFIXES) if not made_by_dpc(path)]
         if not found:
-            raise DataError(f"{self.raw}: no tables ({', '.join(TABLES)})")
+            raise DataError(f"{self.raw}: no tables ({', '.join((*TABLES, *SUFFIXES))})")
         named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in found}
         if len(named) < len(found):
             twins = next(path for path in found if path not in named.values())
@@ -249,7 +247,7 @@ def _load(
         raise DataError(f"{path}: the file is empty")
     try:
         wide = read_wide(path) if track == COLUMNS else None
-        table = wide.table if wide else ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
+        table = wide.table if wide else _open_table(path)
         rows_count = wide is not None and not (wanted or sequences or gap or find_frame_column(table.names))
         column = "" if rows_count else frame_column(table, wanted)
         cloud = wide.cloud(keep) if wide else cloud_of_table(table, keep)
@@ -271,9 +269,16 @@ def _load(
     return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
-def _tables_below(folder: Path) -> Iterator[Path]:
+def _open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+    suffix = path.suffix.lower()
+    return (
+        ArrayTable(path) if suffix in SUFFIXES else ParquetTable(path) if suffix in COLUMNAR else read_text_table(path)
+    )
+
+
+def _tables_below(folder: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
     for place, folders, names in walk_folders(folder):
         folders.sort(key=natural_key)
         for name in sorted(names, key=natural_key):
-            if name.lower().endswith(TABLES) and not name.startswith("."):
+            if name.lower().endswith(suffixes) and not name.startswith("."):
                 yield Path(place) / name

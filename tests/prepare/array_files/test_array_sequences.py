@@ -12,7 +12,7 @@ import scipy.io
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.array_files.axes import axes_of, check_axes
-from dpcli.prepare.scans.array_sequences import ArraySequences
+from dpcli.prepare.scans.array_sequences import MORE_FRAMES, ArraySequences
 from dpcli.store import CloudsReader
 from tests.support.commands import exit_code
 
@@ -332,3 +332,94 @@ def test_recordings_beside_arrays_are_told_as_left_out(tmp_path):
     reader = ArraySequences(tmp_path)
     told = "left out: 1 .db3 file, 1 .mcap file (name the recordings themselves)"
     assert reader.summary(reader.items())[-1] == told
+
+
+BATCH = np.random.default_rng(8).normal(size=(3, 1, 40, 3)) + np.arange(10)[:, None, None] / 50  # (B,T,N,3)
+
+
+@pytest.mark.parametrize("name", ["num_frames", "seq_lengths", "sequence_len", "frame_count"])
+def test_frames_behind_their_count_are_padding(tmp_path, name):
+    """Also where they repeat the last one, and the times there are 0."""
+    lengths = np.array([10, 4, 7])
+    times = np.where(np.arange(10) < lengths[:, None], np.arange(10) / 5, 0)
+    np.savez(tmp_path / "a.npz", points=BATCH, times=times, **{name: lengths})
+    reader = ArraySequences(tmp_path / "a.npz")
+    for item, own, length in zip(reader.items(), BATCH, lengths):
+        sample = reader.read(item, np.random.default_rng(0))
+        assert np.allclose(sample.sequence.points, own[:length].reshape(-1, 3), atol=1e-6)
+        assert np.allclose(sample.sequence.time, np.arange(length) / 5)
+        assert sample.notes.get(MORE_FRAMES, 0) == 10 - length
+    np.savez(tmp_path / "a.npz", points=BATCH, **{name: lengths + 1})
+    with pytest.raises(DataError, match="11 frames of a sequence that has 10"):
+        reader.read(ArraySequences(tmp_path / "a.npz").items()[0], np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "used"),
+    [("mask", 1), ("point_mask", 1), ("valid", 1), ("padding_mask", 0), ("ground_mask", 0), ("fg_mask", 0)],
+)
+def test_only_masks_of_valid_points_leave_points_out(tmp_path, name, used):
+    """Others are named; a mask may have an axis for the coordinates."""
+    mask = np.random.default_rng(9).random(BATCH.shape[:3]) < 0.7
+    for shape in (mask.shape, (*mask.shape, 1)):
+        np.savez(tmp_path / "a.npz", points=BATCH, **{name: mask.reshape(shape)})
+        reader = ArraySequences(tmp_path / "a.npz")
+        items = reader.items()
+        found = reader.read(items[1], np.random.default_rng(0)).sequence.points
+        expected = BATCH[1][mask[1]] if used else BATCH[1].reshape(-1, 3)
+        assert np.allclose(found, expected, atol=1e-6) and (f"not read: {name}" in reader.summary(items)[0]) != used
+
+
+def test_a_mask_of_many_values_is_none(tmp_path):
+    np.savez(tmp_path / "a.npz", points=BATCH, mask=np.arange(BATCH[..., 0].size).reshape(BATCH.shape[:3]) % 5)
+    reader = ArraySequences(tmp_path / "a.npz")
+    with pytest.raises(DataError, match="'mask' holds 5 different numbers, expected two"):
+        reader.read(reader.items()[0], np.random.default_rng(0))
+
+
+def test_labels_that_are_not_used_are_named_and_minus_one_is_unknown(tmp_path):
+    np.savez(tmp_path / "a.npz", points=BATCH, y=np.array([-1, 2, 0]))
+    assert [item.label for item in ArraySequences(tmp_path / "a.npz").items()] == [-1, 2, 0]
+    for bad in ([0.5, 1, 2], [-2, 1, 0], [10**6, 1, 2]):
+        np.savez(tmp_path / "a.npz", points=BATCH, y=np.array(bad))
+        reader = ArraySequences(tmp_path / "a.npz")
+        items = reader.items()
+        assert {item.label for item in items} == {-1} and "not read: y" in reader.summary(items)[0]
+
+
+@pytest.mark.parametrize("form", ["npz", "number", "attribute", "groups", "attributes of groups", "numbered frames"])
+def test_one_label_beside_each_sequence_is_its_own(tmp_path, form):
+    """In the file of each, or in the group of each, as a number or as an attribute."""
+    labels = [2, 0, -1]
+    (tmp_path / "in").mkdir()
+    for place, (own, label) in enumerate(zip(BATCH, labels)):
+        path, group = tmp_path / "in" / f"walk_{place}.h5", ""
+        if form == "npz":
+            np.savez(path.with_suffix(".npz"), points=own, label=label)
+            continue
+        if form not in ("number", "attribute"):
+            path, group = path.with_name("all.h5"), f"walk_{place}/"
+        with h5py.File(path, "a") as file:
+            if form == "numbered frames":
+                file.update({f"{group}{t}/points": cloud for t, cloud in enumerate(own)})
+            else:
+                file[f"{group}points"] = own
+            if form in ("number", "groups"):
+                file[f"{group}y"] = label
+            else:
+                file[group or "/"].attrs["label"] = label
+    reader = ArraySequences(tmp_path / "in")
+    items = reader.items()
+    assert [item.label for item in items] == labels and "not read" not in reader.summary(items)[0]
+    samples = [reader.read(item, np.random.default_rng(0)).sequence for item in items]
+    assert [one.label for one in samples] == labels and np.allclose(
+        samples[1].points, BATCH[1].reshape(-1, 3), atol=1e-6
+    )
+
+
+def test_labels_that_some_sequences_lack_are_not_used_but_named(tmp_path):
+    np.savez(tmp_path / "a.npz", points=BATCH[0], label=1)
+    np.savez(tmp_path / "b.npz", points=BATCH[1])
+    reader = ArraySequences(tmp_path)
+    items = reader.items()
+    assert {item.label for item in items} == {-1} and "not read: label" in reader.summary(items)[0]

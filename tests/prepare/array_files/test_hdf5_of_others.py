@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
+from dpcli.prepare.array_files import containers
 from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import archived_depth
 from dpcli.prepare.scans.array_sequences import ArraySequences
@@ -39,8 +40,8 @@ def test_data_sets_that_were_never_written_refuse_no_others(tmp_path):
     with h5py.File(tmp_path / "c.h5", "w") as file:
         file["depth"] = np.full((5, 40, 50), 900, np.uint16)
         file.create_dataset("labels", (5,), "i4")
-    depth, beside = archived_depth(tmp_path / "c.h5")
-    assert depth.shape == (5, 40, 50) and not beside
+    found = archived_depth(tmp_path / "c.h5")
+    assert found.depth.shape == (5, 40, 50) and not found.small
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file.create_dataset("points", (6, 40, 3), "f4")
     run = told("prepare", "clouds", tmp_path / "b.h5", "-o", tmp_path / "b.out.h5", "--jobs", 1, "--item-seconds", 0)
@@ -80,25 +81,6 @@ def test_a_filter_that_is_missing_is_named(tmp_path):
             arrays["points"][()]
 
 
-@pytest.mark.parametrize("form", ["PyTables", "pandas", "NumPy"])
-def test_tables_of_named_columns_are_told_from_arrays(tmp_path, form):
-    table = np.zeros(50, [("frame", "i4"), ("x", "f4"), ("y", "f4"), ("z", "f4")])
-    path = tmp_path / ("a.npy" if form == "NumPy" else "a.h5")
-    if form == "NumPy":
-        np.save(path, table)
-    else:
-        with h5py.File(path, "w") as file:
-            if form == "PyTables":
-                file["points"] = table
-            else:
-                file["df/block0_values"] = np.zeros((50, 3))
-                file["df"].attrs["pandas_type"] = "frame"
-    words = ("prepare", "clouds", path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
-    for options, said in (([], "holds a table"), (["--frame-column", "frame"], "need it as .csv or .parquet")):
-        run = told(*words, *options)
-        assert run.returncode == 3 and said in run.stderr and "--frame-column" in run.stderr
-
-
 def test_masks_of_truth_values_leave_points_out(tmp_path):
     """As h5py writes NumPy's bool."""
     mask = np.random.default_rng(6).random((6, 40)) < 0.6
@@ -110,14 +92,14 @@ def test_masks_of_truth_values_leave_points_out(tmp_path):
 
 @pytest.mark.parametrize("form", ["h5", "npz"])
 def test_what_is_no_array_of_numbers_is_named(tmp_path, form):
-    """Times as texts or dates, and single numbers, which nobody reads."""
+    """Times as texts, and single numbers, which nobody reads."""
     stamps = np.array([f"2024-03-05T10:00:0{t}" for t in range(6)])
     path = tmp_path / f"a.{form}"
     if form == "npz":
-        np.savez(path, points=clouds(), stamps=stamps.astype("datetime64[ms]"), who=np.array("anna"))
+        np.savez(path, points=clouds(), stamps=stamps, who=np.array("anna"))
     else:
         with h5py.File(path, "w") as file:
-            file["points"], file["stamps"], file["who"] = clouds(), stamps.astype("S"), 7
+            file["points"], file["stamps"], file["who"] = clouds(), stamps.astype("S"), "anna"
     reader = ArraySequences(path)
     assert "not read: stamps, who" in reader.summary(reader.items())[0]
 
@@ -171,3 +153,38 @@ def test_variables_of_octave_have_their_own_names(tmp_path, suffix):
         sequence = reader.read(items[0], np.random.default_rng(0)).sequence
         assert np.array_equal(sequence.points.reshape(6, -1, 3), clouds())
         np.testing.assert_allclose(sequence.time, np.arange(6) / 10)
+
+
+def test_what_lies_in_another_file_is_named_and_not_followed(tmp_path):
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["points"] = clouds()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = h5py.ExternalLink("b.h5", "/points")
+    assert "no arrays of numbers, but points (in b.h5)" in ArraySequences(tmp_path / "a.h5").items()[0].problem
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["xyz"] = clouds() + 1
+    reader = ArraySequences(tmp_path / "a.h5")
+    assert "not read: points (in b.h5)" in reader.summary(reader.items())[0]
+
+
+def test_a_unit_may_be_called_unit(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = clouds() * 1000
+        file["points"].attrs["unit"] = "mm"
+    assert np.allclose(np.stack(frames_of(tmp_path / "a.h5")), clouds(), atol=1e-6)
+
+
+def test_sequences_of_a_file_of_many_arrays_are_opened_by_name(tmp_path, monkeypatch):
+    """Each of hundreds would else look at thousands of arrays."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for walk in range(20):
+            for frame in range(5):
+                file[f"walk_{walk}/{frame}/points"] = clouds()[frame] + walk
+    reader = ArraySequences(tmp_path / "a.h5")
+    items = reader.items()
+    looked, shown = [], containers._shown
+    monkeypatch.setattr(
+        containers, "_shown", lambda file, item, path: looked.append(item.name) or shown(file, item, path)
+    )
+    sample = reader.read(items[7], np.random.default_rng(0)).sequence
+    assert np.allclose(sample.points, (clouds()[:5] + 7).reshape(-1, 3)) and len(set(looked)) == 5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 
+import h5py
 import laspy
 import numpy as np
 import pytest
@@ -438,3 +439,14 @@ def test_a_table_that_names_frames_is_told_what_a_sample_is(tmp_path):
         with pytest.raises(DataError, match="not among the samples") as raised:
             CloudFolders(tmp_path / "in", labels=tmp_path / "labels.csv").items()
         assert ("the frames of one sample" in str(raised.value) and "--frame-column" in str(raised.value)) == told
+
+
+def test_hdf5_files_of_one_cloud_each_are_frames(tmp_path):
+    """Where nothing else lies there: what dpc makes is HDF5, too, and may lie beside the clouds."""
+    clouds = np.random.default_rng(0).normal(size=(4, 30, 3)).astype(np.float32)
+    for place, cloud in enumerate(clouds):
+        with h5py.File(tmp_path / f"{place}.h5", "w") as file:
+            file["points"] = cloud
+    reader = CloudFolders(tmp_path)
+    sample = reader.read(reader.items()[0], np.random.default_rng(0)).sequence
+    assert np.array_equal(sample.points.reshape(clouds.shape), clouds)

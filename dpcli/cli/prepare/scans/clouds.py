@@ -136,6 +136,7 @@ def _make_reader(
     """
     from dpcli.prepare.array_files.containers import made_by_dpc
     from dpcli.prepare.decode.cloud_files import SUFFIXES
+    from dpcli.prepare.named_columns import holds_table
     from dpcli.prepare.recordings.recording import holds_only_recordings
     from dpcli.prepare.scans.array_sequences import ArraySequences, holds_sequences
     from dpcli.prepare.scans.clouds import CloudFolders
@@ -155,7 +156,8 @@ def _make_reader(
     if topic or holds_only_recordings(raw, SUFFIXES):
         return RecordedClouds(raw, topic=topic, **shared)
     of_tables = table != TableColumns() or (units.track == COLUMNS and raw.is_dir())
-    if (raw.is_file() and raw.suffix.lower() in TABLES) or of_tables:
+    is_table = raw.is_file() and (raw.suffix.lower() in TABLES or not units.axes and holds_table(raw))
+    if of_tables or is_table:
         return TableSequences(raw, **vars(table), **shared)
     if units.axes or holds_sequences(raw, SUFFIXES):
         return ArraySequences(raw, axes=units.axes, pattern=pattern, **shared)

@@ -1,0 +1,89 @@
+"""What lies beside depth in one file of named arrays: times, the camera, the depth's unit, and what is named because nobody reads it."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.decode.pinhole_camera import Intrinsics
+
+FRAMES = 8
+DEPTH = np.random.default_rng(2).integers(900, 1100, (FRAMES, 36, 48)).astype(np.uint16)
+SECONDS = np.arange(FRAMES) * 0.1
+
+
+def read(path, **options):
+    """The sequence of a file, and its notes."""
+    reader = DepthVideos(inputs=(path,), **options)
+    (item,) = reader.items()
+    sample = reader.read(item, np.random.default_rng(0))
+    return sample.sequence, " ".join(sample.notes)
+
+
+def write(path, data, **attributes):
+    """A file of arrays with attributes of its depth."""
+    if path.suffix == ".npz":
+        np.savez(path, **data)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in data.items():
+                file[name] = values
+            file["depth"].attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("timestamps", 5 + SECONDS),
+        ("t", SECONDS),
+        ("time_ms", np.arange(FRAMES) * 100),
+        ("stamps", 1_700_000_000_000_000_000 + np.arange(FRAMES) * 100_000_000),
+        ("times", (np.arange(FRAMES) * 1e5 + 1.7e15)[:, None].astype(np.int64)),
+    ],
+)
+@pytest.mark.parametrize("form", ["npz", "h5"])
+def test_times_beside_depth_are_those_of_its_frames(tmp_path, form, name, values):
+    path = write(tmp_path / f"a.{form}", {"depth": DEPTH, name: values})
+    sequence, notes = read(path)
+    assert np.allclose(sequence.time, SECONDS, atol=1e-6) and "not read" not in notes
+    assert np.allclose(read(path, stride=3)[0].time, SECONDS[::3], atol=1e-6)
+    assert np.allclose(read(path, fps=5)[0].time, 2 * SECONDS)
+
+
+@pytest.mark.parametrize("values", [np.zeros(FRAMES), np.arange(FRAMES - 1) * 0.1, np.arange(FRAMES), SECONDS[::-1]])
+def test_times_that_do_not_fit_are_named(tmp_path, values):
+    sequence, notes = read(write(tmp_path / "a.h5", {"depth": DEPTH, "time": values}))
+    assert sequence.time is None and "arrays that are not read (time)" in notes
+
+
+@pytest.mark.parametrize("place", ["numbers", "attributes"])
+def test_a_camera_and_a_unit_in_single_numbers_of_hdf5_are_used(tmp_path, place):
+    """As `file["fx"] = 50.0` and `depth.attrs["fx"] = 50.0` write them."""
+    told = {"fx": 50.0, "fy": 51.0, "cx": 20.0, "cy": 17.0, "depth_scale": 0.0005}
+    data = {"depth": DEPTH, **(told if place == "numbers" else {})}
+    found, notes = read(write(tmp_path / "a.h5", data, **({} if place == "numbers" else told)))
+    wanted, _ = read(
+        write(tmp_path / "b.h5", {"depth": DEPTH}), intrinsics=Intrinsics(50.0, 51.0, 20.0, 17.0), depth_scale=2000
+    )
+    assert np.array_equal(found.points, wanted.points) and "not read" not in notes
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1000), ("cm", 100), ("raw", 1000)])
+def test_the_unit_of_depth_in_whole_numbers_counts(tmp_path, unit, scale):
+    found, _ = read(write(tmp_path / "a.h5", {"depth": DEPTH}, units=unit))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+
+
+def test_depth_in_meters_needs_no_scale_of_attributes(tmp_path):
+    found, _ = read(write(tmp_path / "a.h5", {"depth": np.float32(DEPTH / 1000)}, units="m", depth_scale=1000.0))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 1000)
+
+
+def test_large_arrays_beside_depth_are_named(tmp_path):
+    """A mask of the depth's shape may leave out what is seen, or say where a person is: nobody knows."""
+    for form in ("h5", "npz"):
+        _, notes = read(write(tmp_path / f"a.{form}", {"depth": DEPTH, "mask": DEPTH > 1000}))
+        assert "arrays that are not read (mask)" in notes
