@@ -81,16 +81,36 @@ class _Workers(ForkServerContext):
     Process = Worker
 
 
-def _new_pool(jobs: int) -> ProcessPoolExecutor:
-    """Raises DpcError where the machine has no place for what processes share, as some containers without /dev/shm."""
+def _new_pool(jobs: int, without: str) -> ProcessPoolExecutor:
+    """Raises DpcError where the machine has no place for what processes share, as some containers without /dev/shm.
+
+    without: the options that do without processes.
+    """
     ensure_server()
     try:
         return ProcessPoolExecutor(min(jobs, _MOST), _Workers(), _start_worker, (log.debug, log.level))
+    except ConnectionError as error:
+        raise _no_server(error, without) from None
     except (OSError, ImportError) as error:
         said = error.strerror if isinstance(error, OSError) else error
         raise DpcError(
-            f"processes can't share locks on this machine, which needs /dev/shm for them ({said}); --jobs 1 needs none"
+            f"processes can't share locks on this machine, which needs /dev/shm for them ({said}); {without} needs none"
         ) from None
+
+
+def _submitted(executor: Executor, without: str, work: Callable[[Any], Any], *item: Any) -> Future:
+    """Raises DpcError where the server that starts processes has ended. without: as `_new_pool`; "" for a caller's executor."""
+    try:
+        return executor.submit(work, *item)
+    except (ConnectionError, EOFError) as error:
+        if not without:
+            raise
+        raise _no_server(error, without) from None
+
+
+def _no_server(error: ConnectionError | EOFError, without: str) -> DpcError:
+    said = getattr(error, "strerror", None) or "it ended without a word"
+    return DpcError(f"the server that starts worker processes can't run on this machine ({said}); {without} needs none")
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
@@ -113,26 +133,27 @@ def _was_lost(error: Exception) -> bool:
 class _Pool:
     """Holds processes of this machine, or an executor of the caller's, and replaces processes that died."""
 
-    def __init__(self, function: Callable[[Any], Any], jobs: int, executor: Executor | None) -> None:
+    def __init__(self, function: Callable[[Any], Any], jobs: int, executor: Executor | None, apart: bool) -> None:
         self._guarded = partial(_guarded, function)
         packed = executor is None and handover.POSSIBLE and fast_transport()
         self._work = partial(handover.packed, self._guarded) if packed else self._guarded
         self._jobs, self._given = jobs, executor
+        self._without = "" if executor else "--jobs 1 --item-seconds 0" if apart else "--jobs 1"
         self._open()
 
     def _open(self) -> None:
         self._strangers = set(multiprocessing.active_children())
-        self._executor = self._given or _new_pool(self._jobs)
+        self._executor = self._given or _new_pool(self._jobs, self._without)
         self._children: set = set()
 
     def submit(self, item: Any) -> Future:
         """Has an item worked on, by new processes where the old ones broke."""
         try:
-            future = self._executor.submit(self._work, item)
+            future = _submitted(self._executor, self._without, self._work, item)
         except BrokenProcessPool:
             self._end_broken()
             self._open()
-            future = self._executor.submit(self._work, item)
+            future = _submitted(self._executor, self._without, self._work, item)
         self._children |= (
             set(multiprocessing.active_children()) - self._strangers
         )  # now: later it forgets those that ended
@@ -157,9 +178,9 @@ class _Pool:
             return self._try_alone(item)
 
     def _try_alone(self, item: Any) -> Any:
-        alone, children = _new_pool(1), []
+        alone, children = _new_pool(1, self._without), []
         try:
-            tried = alone.submit(self._guarded, item)
+            tried = _submitted(alone, self._without, self._guarded, item)
             children = list(alone._processes.values())  # type: ignore[attr-defined]  # the public way asks how they ended
             return _awaited(tried, alone, set(children))
         except BrokenProcessPool:
@@ -177,7 +198,9 @@ class _Pool:
         """Ends the processes; an executor of the caller's stays."""
         if self._given is None:
             try:
-                self._executor.submit(int)  # the one public way to learn that processes died since the last item
+                _submitted(
+                    self._executor, self._without, int
+                )  # the one public way to learn that processes died since the last item
             except BrokenProcessPool:
                 _end(set(multiprocessing.active_children()) - self._strangers)
             self._executor.shutdown(wait=True, cancel_futures=True)
@@ -244,7 +267,7 @@ def ordered_map(
         for item in items:
             yield item, _guarded(function, item)
         return
-    pool, waiting = _Pool(function, max(jobs, 1), executor), deque()
+    pool, waiting = _Pool(function, max(jobs, 1), executor, apart), deque()
     try:
         for item in items:
             waiting.append((item, pool.submit(item)))

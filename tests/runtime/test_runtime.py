@@ -33,13 +33,16 @@ def square(x: int) -> int:
     return x * x
 
 
-def test_a_machine_whose_processes_share_nothing_is_told_what_works(monkeypatch):
+@pytest.mark.parametrize(("apart", "works"), [(False, "--jobs 1"), (True, "--jobs 1 --item-seconds 0")])
+def test_a_machine_whose_processes_share_nothing_is_told_what_works(apart, works, monkeypatch):
+    """What was run with --jobs 1 and has a limit on an item's time needs a process all the same."""
+
     def no_place(*_):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(pool, "ProcessPoolExecutor", no_place)
-    with pytest.raises(DpcError, match=r"/dev/shm for them \(Read-only file system\); --jobs 1 needs none"):
-        next(ordered_map(square, range(2), 2))
+    with pytest.raises(DpcError, match=rf"/dev/shm for them \(Read-only file system\); {works} needs none"):
+        next(ordered_map(square, range(2), 1 if apart else 2, apart=apart))
 
 
 def die_at_three(x: int) -> int:

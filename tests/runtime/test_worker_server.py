@@ -100,6 +100,17 @@ def test_ctrl_c_leaves_no_folder_of_the_server_in_tmpdir(tmp_path: Path) -> None
         assert done.returncode == 130 and list(temporary.iterdir()) == [], done.stderr
 
 
+def test_a_server_that_can_t_run_is_a_sentence(tmp_path: Path) -> None:
+    """As where nobody may run the program of this very Python again."""
+    start = (
+        "import multiprocessing; multiprocessing.set_executable('/bin/false'); from dpcli.__main__ import main; main()"
+    )
+    done = run_with_workers(["-c", start], tmp_path, tmp_path / "tmp")
+    said = b"dpc: error: the server that starts worker processes can't run on this machine ("
+    assert done.returncode == 1 and said in done.stderr and b"; --jobs 1 needs none\n" in done.stderr, done.stderr
+    assert b"Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("letters", [70, 71, 120])
 def test_workers_start_where_the_path_of_tmpdir_is_too_long_for_a_socket(tmp_path: Path, letters: int) -> None:
     with tempfile.TemporaryDirectory(dir="/tmp") as short:

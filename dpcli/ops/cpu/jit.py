@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,6 +19,9 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import load_numba_without_blas
 
 load_numba_without_blas()
+# Meant for a user's own code: vector instructions have no form in plain Python. Numba reads the variable again at any time.
+os.environ.pop("NUMBA_DISABLE_JIT", None)
+numba.config.DISABLE_JIT = False
 
 _FOLDER = Path(__file__).parent
 _SPLATTING = _FOLDER.parent / "splatting"

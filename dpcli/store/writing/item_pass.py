@@ -94,9 +94,28 @@ class ItemPass:
         `write` returns what the progress bar counts beside items. Raises what `load`, `work` and `write` raise, DataError
         when every item of the whole was passed over, and Stopped after a stop signal, with what is done kept.
         """
+        with stop_requested() as stop:
+            try:
+                self._pass(work, load, write, workers, stop)
+            except KeyboardInterrupt:
+                kept = f"{self._kept()}; run again to continue" if self.writer.resume else "nothing was kept"  # a pipe
+                log.warn(f"interrupted; {kept}")
+                raise
+        if not len(self.writer) and self.writer.positions is None:
+            reason = self.writer.skipped[0][1] if self.writer.skipped else "the index is empty"
+            raise DataError(f"none of the {len(self.places)} {self.words.unit}s is good; the first: {reason}")
+
+    def _pass(
+        self,
+        work: Callable[[Any], Any],
+        load: Callable[[int], Any],
+        write: Callable[[int, Any], dict[str, float]],
+        workers: Workers,
+        stop: StopRequest,
+    ) -> None:
         written = set(self.written)
         todo = [place for place in self.places if place not in written]
-        with stop_requested() as stop, Progress(self.words.task, len(self.places), self.words.unit) as bar:
+        with Progress(self.words.task, len(self.places), self.words.unit) as bar:
             bar.skip(len(written))
             slots = min(workers.slots, len(todo))
             items = ((place, load(place)) for place in todo)
@@ -107,18 +126,11 @@ class ItemPass:
                     for (place, _), result in results:
                         self._take(place, result, write, bar)
                         self._check(stop)
-            except KeyboardInterrupt:
-                kept = f"{self._kept()}; run again to continue" if self.writer.resume else "nothing was kept"  # a pipe
-                log.warn(f"interrupted; {kept}")
-                raise
             except Exception as error:
                 if isinstance(error, DpcError) or workers.executor is not None:
                     self._check(stop)  # a signal to the whole process group takes the workers down as well
                 self.writer.keep = not isinstance(error, DataError)  # it says nothing about the items
                 raise
-        if not len(self.writer) and self.writer.positions is None:
-            reason = self.writer.skipped[0][1] if self.writer.skipped else "the index is empty"
-            raise DataError(f"none of the {len(self.places)} {self.words.unit}s is good; the first: {reason}")
 
     def _check(self, stop: StopRequest) -> None:
         if self.writer.resume:

@@ -45,6 +45,15 @@ def test_a_kernel_is_compiled_once_and_the_user_is_told(tmp_path):
     assert run(tmp_path, "after", patience=60) == ("6.0 0 1", "")
 
 
+def test_a_switch_for_code_of_a_user_s_own_leaves_kernels_compiled(tmp_path, monkeypatch):
+    """NUMBA_DISABLE_JIT=1, as people set it to debug; numba looks at it again when another variable of its own changes."""
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    (tmp_path / "own.py").write_text(
+        f"import os, numba\nos.environ['NUMBA_NUM_THREADS'] = '1'\nnumba.core.config.reload_config()\n{TWICE}"
+    )
+    assert run(tmp_path, "any", patience=60) == ("6.0 0 1", "")
+
+
 @pytest.fixture
 def compiled(tmp_path, monkeypatch):
     """Calls a kernel for the first time in this process, so to say; returns whether it was found in the cache."""
