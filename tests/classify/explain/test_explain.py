@@ -543,6 +543,8 @@ def test_pac_writes_clouds_pictures_and_animations(data, weights, tmp_path, monk
         "rule=gradient",
         "--set",
         "class=bend",
+        "--set",
+        "stage=1",  # where this untrained network has evidence for the class in both streams
     )
     assert dpc(*words, "-o", out, "--picture", png, "--animation", gif, "--set", "frames=3") == 0
     with CloudsReader(out) as reader, h5py.File(out) as file:
