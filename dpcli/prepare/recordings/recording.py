@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
@@ -27,6 +27,7 @@ _UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
+Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,11 @@ class Recording:
         tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
         return f"{said}; if its index is not whole, {tool} makes it" if tool and not held else said
 
-    def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
-        """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
+    def messages(self, topic: str, decode: Callable[[Message], Decoded], stride: int = 1) -> Iterator[Decoded]:
+        """Yields what ``decode`` makes of every ``stride``-th message of a topic, in the order they were recorded.
+
+        Raises DataError at damage, and where a message can't be decoded.
+        """
         connections = [one for one in self._reader.connections if one.topic == topic]
         with _damage_named(self.path):
             raw_messages = self._reader.messages(connections=connections)
@@ -141,13 +145,15 @@ class Recording:
         while True:
             with _damage_named(self.path):
                 found = next(raw_messages, None)
-                if found is None:
-                    return
-                connection, logged, raw = found
-                content = self._content(raw, connection) if self.read % stride == 0 else None
+            if found is None:
+                return
+            connection, logged, raw = found
+            taken = self.read % stride == 0
             self.read += 1
-            if content is not None:
-                yield Message(content, connection.msgtype, logged)
+            if taken:
+                with _damage_named(self.path, topic):
+                    decoded = decode(Message(self._content(raw, connection), connection.msgtype, logged))
+                yield decoded
 
     def _content(self, raw: bytes, connection: Any) -> Any:
         kind = connection.msgtype
@@ -225,16 +231,25 @@ def _small_suffix(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Turns whatever a parser of recordings raises into a DataError: damaged files make it stumble over anything."""
+def _damage_named(path: Path, topic: str = "") -> Iterator[None]:
+    """Turns whatever a parser of recordings raises into a DataError: damaged files make it stumble over anything.
+
+    topic: the one whose message is decoded, "" where none is yet.
+    """
     try:
         yield
+    except DataError as error:
+        raise DataError(f"{error} (topic {topic})" if topic else str(error)) from None
+    except DpcError:
+        raise
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         tool = _REPAIR_TOOLS.get(path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
+        expected = "expected a ROS 1 bag, a ROS 2 bag, or an MCAP file"
+        if topic:
+            expected, hint = "it is damaged, or the file describes its type wrongly", ""
         if not path.is_dir() and _packs_messages(path.parent):
             hint = f"; as the {_METADATA} beside it says, its messages are packed: name the folder {path.parent}"
-        raise DataError(
-            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file{hint}"
-        ) from None
+        what = f"a message of {topic} can't be decoded" if topic else "not a readable recording"
+        raise DataError(f"{path}: {what} ({said}); {expected}{hint}") from None

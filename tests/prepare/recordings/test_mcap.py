@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from functools import cache
 from itertools import combinations
 
@@ -134,6 +135,39 @@ def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path):
     np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
 
 
+FIELDS = ["header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "data", "is_dense"]
+
+
+@pytest.mark.parametrize("lacking", [*FIELDS, "stamp", "frame_id", "datatype", "count"])
+def test_messages_whose_type_lacks_a_field_are_read_or_named_with_their_topic(tmp_path, lacking):
+    topic, encoding, name, form, described = ros_channel(False)
+    described = re.sub(rf"^\S+ {lacking}$", "", described, flags=re.MULTILINE)
+    (frame,) = frames_of(1)
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    store.register(typesys.get_types_from_msg(described, name))
+    whole = messages_of(False).cloud(frame, START)
+
+    def without(one):
+        """The message, and those in it, of the types that lack a field."""
+        if isinstance(one, list):
+            return [without(part) for part in one]
+        if not hasattr(one, "__msgtype__"):
+            return one
+        kind = store.types[one.__msgtype__]
+        return kind(**{k: without(v) for k, v in vars(one).items() if k in kind.__dataclass_fields__})
+
+    path = tmp_path / "run.mcap"
+    raw = bytes(store.serialize_cdr(without(whole), name))
+    path.write_bytes(mcap([(topic, encoding, name, form, described)], [(0, START, raw)]))
+    if lacking in ("header", "stamp", "frame_id", "is_dense"):
+        np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
+        return
+    reader = RecordedClouds(path)
+    with pytest.raises(DataError, match=f"{path}: a message of /points can't be decoded .*{lacking}"):
+        reader.read(reader.items()[0], RNG)
+
+
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_poses_of_clouds_move_their_points_and_returns_that_met_nothing_are_dropped(tmp_path, encoding):
     frames = frames_of(2)
@@ -186,7 +220,7 @@ def test_depth_of_foxglove_with_its_camera(tmp_path, encoding, form):
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_foxglove_messages_that_were_cut_are_named(tmp_path, encoding):
     whole = cloud(frames_of(1)[0], START, encoding)
-    said = "not a readable recording|has fewer|is damaged|bytes"
+    said = "a message of /points can't be decoded .*it is damaged|has fewer|bytes.*/points"
     for kept in range(1, len(whole), 7):
         path = tmp_path / f"{kept}.mcap"
         path.write_bytes(mcap([("/points", encoding, FOXGLOVE, "", "")], [(0, START, whole[:kept])]))
