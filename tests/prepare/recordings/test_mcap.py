@@ -185,6 +185,43 @@ def test_poses_of_clouds_move_their_points_and_returns_that_met_nothing_are_drop
     assert sample.notes == {AT_ORIGIN: 3}
 
 
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    turn=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1),
+    stem=st.sampled_from(["normal_", "n", "N", "v", "velocity_"]),
+    kept=st.sets(st.sampled_from("xyz"), min_size=1),
+)
+def test_poses_of_clouds_turn_normals_and_velocities_as_they_turn_what_lies_between_points(tmp_path, turn, stem, kept):
+    axes = "XYZ" if stem == "N" else "xyz"
+    frame = np.zeros(6, np.dtype([(name, "<f4") for name in (*"xyz", *(stem + axis for axis in axes))]))
+    for k, name in enumerate(frame.dtype.names):
+        frame[name][:3] = frame[name][3:] = np.random.default_rng([7, k]).uniform(1, 100, 3)
+    for axis, name in zip("xyz", axes):
+        frame[axis][3:] += frame[stem + name][:3]  # three points, and each where its vector ends
+    path = tmp_path / "run.mcap"
+    raw = cloud(frame, START, "protobuf", ([1.0, 2.0, 3.0], list(turn)))
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    sequence = read(path, keep=tuple(stem + axes["xyz".index(axis)] for axis in sorted(kept))).sequence
+    for axis in kept:
+        name, place = axes["xyz".index(axis)], "xyz".index(axis)
+        ends = sequence.points[:3, place] + sequence.extra[f"field_{stem}{name}"][:3]
+        np.testing.assert_allclose(ends, sequence.points[3:, place], atol=1e-3)
+
+
+def test_a_normal_without_its_other_parts_is_refused_where_a_pose_turns_it(tmp_path):
+    frame = np.ones(3, np.dtype([(name, "<f4") for name in (*"xyz", "normal_x", "normal_y")]))
+    path = tmp_path / "run.mcap"
+    for turn in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]):
+        raw = cloud(frame, START, "protobuf", ([1.0, 2.0, 3.0], turn))
+        path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+        if turn[3]:
+            assert (read(path, keep=("normal_x",)).sequence.extra["field_normal_x"] == 1).all()
+            continue
+        with pytest.raises(DataError, match="can't turn normal_x, normal_y, normal_z .* no normal_z"):
+            reader = RecordedClouds(path, keep=("normal_x",))
+            reader.read(reader.items()[0], RNG)
+
+
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 @pytest.mark.parametrize("form", ["16UC1", "32FC1", "png"])
 def test_depth_of_foxglove_with_its_camera(tmp_path, encoding, form):
