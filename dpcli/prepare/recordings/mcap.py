@@ -141,8 +141,10 @@ class _McapFile:
                 if numbers:
                     self._channels_in[int.from_bytes(index[16:24], "little") + _RECORD.size] = numbers
             elif kind == _STATISTICS:
-                counts = _part(self._read(at, length), 42)[0]
-                told = Counter(dict(struct.iter_unpack("<HQ", counts)))
+                statistics = self._read(at, length)
+                counts = dict(struct.iter_unpack("<HQ", _part(statistics, 42)[0]))
+                if sum(counts.values()) == int.from_bytes(statistics[:8], "little"):  # some leave them out
+                    told = Counter(counts)
             elif kind == _MESSAGE:
                 number, _, logged, _ = _MESSAGE_HEAD.unpack(self._read(at, _MESSAGE_HEAD.size))
                 self._pieces.append((logged, at, kind, length))

@@ -27,7 +27,12 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 LOOSE = np.dtype({"names": ["ring", "z", "x", "y"], "formats": ["u1", "<f4", "<f4", "<f4"], "offsets": [0, 2, 7, 11]})
 FOXGLOVE = "foxglove.PointCloud"
 PARTS = ("schemas", "channels", "statistics", "index")
-SUMMARIES = [some for count in range(len(PARTS) + 1) for some in combinations(PARTS, count)]
+SUMMARIES = [
+    tuple(one if one != "statistics" or counted else "uncounted" for one in some)
+    for counted in (True, False)
+    for count in range(len(PARTS) + 1)
+    for some in combinations(PARTS, count)
+]
 LAYOUTS = st.builds(
     Layout,
     chunk=st.integers(0, 3),
@@ -306,7 +311,15 @@ def test_damaged_files_are_named(tmp_path, damage, said):
 
 
 @pytest.mark.parametrize("chunk", [0, 2])
-@pytest.mark.parametrize("summary", [(), ("channels", "statistics", "index"), ("schemas", "channels", "statistics")])
+@pytest.mark.parametrize(
+    "summary",
+    [
+        (),
+        ("channels", "statistics", "index"),
+        ("schemas", "channels", "statistics"),
+        ("schemas", "channels", "uncounted"),
+    ],
+)
 def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_path, chunk, summary):
     frames, stamps = frames_of(6), [START + 10**8 * t for t in range(6)]
     make = messages_of(False)
