@@ -28,7 +28,7 @@ from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _STATISTICS = 2, 3, 4, 5, 6, 8, 11
 _RECORD, _MESSAGE_HEAD, _CHUNK_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ"), struct.Struct("<QQQI")
-_IDL = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
+_IDL = re.compile(r"^={80}\nIDL: .*$", re.MULTILINE)
 _ROS_SCHEMAS = ("ros1msg", "ros2msg", "ros2idl", "omgidl", "")
 
 
@@ -271,7 +271,7 @@ def _typestore(channel: Channel, others: Iterable[Channel]) -> Any:
 def _types(channel: Channel) -> dict[str, Any]:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    text = channel.definition.decode("utf-8", "replace")
+    text = channel.definition.decode("utf-8", "replace").replace("\r\n", "\n")  # as files of Windows end their lines
     if not channel.form.endswith("idl"):
         return get_types_from_msg(text, channel.msgtype)
     parts = _IDL.split(text)  # of one type each

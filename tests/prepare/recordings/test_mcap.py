@@ -130,11 +130,13 @@ def test_every_layout_and_encoding_holds_what_was_written(tmp_path, encoding, la
         )
 
 
-def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path):
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path, ends):
     topic, *kind, described = ros_channel(False)
     header = described[: described.index("=" * 80)]
     (frame,) = frames_of(1)
     path = tmp_path / "run.mcap"
+    described = described.replace("\n", ends)
     channels = [(topic, *kind, header), ("/other", *kind, described), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
     path.write_bytes(mcap(channels, [(0, START, ros_cloud(frame, START, False))]))
     np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
