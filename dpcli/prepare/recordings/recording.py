@@ -11,6 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
+import yaml
+
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
@@ -98,10 +100,10 @@ class Recording:
     the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
     """
 
-    def __init__(self, path: Path, reader: Any, topics: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, reader: Any, topics: Mapping[str, tuple[str | None, int]]) -> None:
         self.path, self._reader, self.read = path, reader, 0
-        self.topics: dict[str, tuple[str, int]] = {
-            name: (info.msgtype or "several types", info.msgcount) for name, info in topics.items()
+        self.topics = {
+            name: (kind or "several types", count) for name, (kind, count) in topics.items()
         }  # name -> (type, number of messages)
         self.unlisted = _unlisted(path) if path.is_dir() else []
 
@@ -187,6 +189,23 @@ def _plain_mcap(folder: Path) -> list[Path]:
     return sorted(listed) if all(one.suffix == ".mcap" for one in listed) else []
 
 
+def _declared(folder: Path) -> dict[str, tuple[str, int]]:
+    """Returns the topics of a ROS 2 bag, name -> (type, number of messages), as its metadata.yaml has them.
+
+    Raises ValueError where it is damaged, or a file that it lists isn't there.
+    """
+    try:
+        told = yaml.safe_load((folder / _METADATA).read_bytes())["rosbag2_bagfile_information"]
+        names = [Path(one).name for one in told["relative_file_paths"]]
+        every = [(one["topic_metadata"], int(one["message_count"])) for one in told["topics_with_message_count"] or ()]
+        topics = {str(topic["name"]): (str(topic["type"]), count) for topic, count in every}
+    except Exception as error:
+        raise ValueError(f"its {_METADATA} is damaged: {type(error).__name__} {error}") from None
+    if lacking := [name for name in names if not (folder / name).exists()]:
+        raise ValueError(f"its {_METADATA} lists files that are not there: {first_names(lacking, _LISTED)}")
+    return topics
+
+
 @contextmanager
 def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
@@ -202,16 +221,18 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            if called.suffix == ".mcap" and not called.is_dir():
-                reader: Any = McapReader([called])
-                topics = reader.topics
+            files = _plain_mcap(called) if called.is_dir() else [called] if called.suffix == ".mcap" else []
+            if files:
+                declared = _declared(called) if called.is_dir() else {}
+                reader: Any = McapReader(files)
+                topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
+                for name, (kind, count) in declared.items():
+                    held = topics.get(name, (kind, 0))
+                    topics[name] = held[0], max(held[1], count)
             else:
                 reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
                 reader.open()
-                topics = reader.topics
-                if files := _plain_mcap(called):
-                    reader.close()
-                    reader = McapReader(files)
+                topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
         try:
             yield Recording(path, reader, topics)
         finally:

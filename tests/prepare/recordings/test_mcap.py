@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.recordings.depth import read_recorded_depth
+from dpcli.prepare.recordings.topic_frames import LACKING
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.mcap_helpers import Layout, cloud, mcap, protobuf
 from tests.support.recording_helpers import START, Messages, write_recording
@@ -339,6 +340,37 @@ def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_
     np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
     np.testing.assert_allclose(sample.sequence.time, np.arange(6) / 10)
     assert not sample.notes
+
+
+@pytest.mark.parametrize(
+    ("told", "instead", "said"),
+    [
+        ("storage_identifier: mcap", "storage_identifier: ''", ""),  # as reindexing leaves it
+        ("version: 9", "version: 10", ""),
+        ("message_count: 2", "message_count: 0", ""),
+        ("message_count: 2", "message_count: 3", "lack"),
+        ("  - run.mcap", "  - run.mcap\n  - gone.mcap", "lists files that are not there: gone.mcap"),
+        ("relative_file_paths", "paths", "metadata.yaml is damaged: KeyError 'relative_file_paths'"),
+    ],
+)
+def test_files_of_a_bag_of_ros_2_count_where_its_metadata_says_otherwise(tmp_path, told, instead, said):
+    make = messages_of(False)
+    frames = frames_of(2)
+    content = [("/points", START + t, make.cloud(frame, START + t)) for t, frame in enumerate(frames)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    raw = [ros_cloud(frame, START + t, False) for t, frame in enumerate(frames)]
+    channels = [ros_channel(False), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
+    (bag / "run.mcap").write_bytes(mcap(channels, [(0, START + t, one) for t, one in enumerate(raw)]))
+    metadata = (bag / "metadata.yaml").read_text()
+    assert told in metadata
+    (bag / "metadata.yaml").write_text(metadata.replace(told, instead))
+    if said not in ("", "lack"):
+        with pytest.raises(DataError, match=said):
+            read(bag)
+        return
+    sample = read(bag)
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
+    assert sample.notes == ({LACKING: 1} if said else {})
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
