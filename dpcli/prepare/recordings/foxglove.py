@@ -129,6 +129,8 @@ def _of_json(said: Any, kind: str) -> SimpleNamespace:
 def _json_value(said: Any, one: Any) -> Any:
     if isinstance(one, str):
         return _of_json(said, one)
+    if one is int and isinstance(said, float) and not said.is_integer():
+        raise ValueError(f"{said} stands where Foxglove's messages have whole numbers")
     return base64.b64decode(said, validate=True) if one is bytes else _whole(int(said)) if one is int else one(said)
 
 

@@ -273,6 +273,16 @@ def test_foxglove_messages_that_were_cut_are_named(tmp_path, encoding):
             read(path)
 
 
+@pytest.mark.parametrize("place", ["point_stride", "timestamp"])
+def test_a_fraction_where_foxglove_has_whole_numbers_is_refused(tmp_path, place):
+    said = json.loads(cloud(frames_of(1)[0], START, "json"))
+    said[place] = {"sec": 1.5, "nsec": 0} if place == "timestamp" else 12.7
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap([("/points", "json", FOXGLOVE, "", "")], [(0, START, json.dumps(said).encode())]))
+    with pytest.raises(DataError, match=r"(1.5|12.7) stands where Foxglove's messages have whole numbers"):
+        read(path)
+
+
 def test_a_point_of_foxglove_that_was_cut_is_named(tmp_path):
     frame = frames_of(1)[0]
     raw = cloud(frame, START, "protobuf").removesuffix(frame.tobytes())
