@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -55,10 +55,12 @@ class McapReader:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._files: list[_McapFile] = []
+        self._names = [path.name if len(paths) > 1 else "" for path in paths]
         self._stores: dict[Channel, Any] = {}
         try:
-            for path in paths:
-                self._files.append(_McapFile(path))
+            for path, name in zip(paths, self._names):
+                with _named(name):
+                    self._files.append(_McapFile(path))
         except BaseException:
             self.close()
             raise
@@ -77,7 +79,12 @@ class McapReader:
 
     def messages(self, connections: Collection[Channel]) -> Iterator[tuple[Channel, int, bytes]]:
         """Yields the messages of channels, sorted by when they were recorded: the channel, that in nanoseconds, the bytes."""
-        return heapq.merge(*(file.messages(connections) for file in self._files), key=lambda message: message[1])
+
+        def of_file(file: _McapFile, name: str) -> Iterator[tuple[Channel, int, bytes]]:
+            with _named(name):
+                yield from file.messages(connections)
+
+        return heapq.merge(*map(of_file, self._files, self._names), key=lambda message: message[1])
 
     def decode(self, channel: Channel, raw: bytes) -> Any:
         """Returns the content of a message, with its fields as attributes. Raises ValueError where it is damaged."""
@@ -90,6 +97,17 @@ class McapReader:
             self._stores[channel] = _typestore(channel, self.connections)
         store = self._stores[channel]
         return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, channel.msgtype)
+
+
+@contextmanager
+def _named(file: str) -> Iterator[None]:
+    """Puts the name of a file before what is raised about it; "" leaves it as it is."""
+    try:
+        yield
+    except Exception as error:
+        if not file:
+            raise
+        raise ValueError(f"{file}: {error}") from None
 
 
 class _McapFile:

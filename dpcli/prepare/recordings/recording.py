@@ -265,7 +265,7 @@ def _damage_named(path: Path, topic: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
-        tool = _REPAIR_TOOLS.get(path.suffix.lower())
+        tool = _REPAIR_TOOLS.get(".mcap" if _plain_mcap(path) else path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
         expected = "expected a ROS 1 bag, a ROS 2 bag, or an MCAP file"
         if topic:

@@ -383,6 +383,30 @@ def test_files_of_a_bag_of_ros_2_count_where_its_metadata_says_otherwise(tmp_pat
     assert sample.notes == ({LACKING: 1} if said else {})
 
 
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
+def test_the_damaged_one_of_several_files_of_a_bag_is_named(tmp_path, damage):
+    make = messages_of(False)
+    frames = frames_of(4)
+    content = [("/points", START + t, make.cloud(frame, START + t)) for t, frame in enumerate(frames)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    (bag / "run.mcap").unlink()
+    for part in (0, 1):
+        raw = [(0, START + t, ros_cloud(frames[t], START + t, False)) for t in (2 * part, 2 * part + 1)]
+        data = mcap([ros_channel(False)], raw)
+        if part and damage == "cut":
+            data = data[: len(data) // 2]
+        elif part:
+            at = data.index(frames[3].tobytes())
+            data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+        (bag / f"run_{part}.mcap").write_bytes(data)
+    told = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(told.replace("  - run.mcap\n", "  - run_0.mcap\n  - run_1.mcap\n"))
+    said = "it is cut off" if damage == "cut" else "a chunk is damaged"
+    reader = RecordedClouds(bag)
+    with pytest.raises(DataError, match=rf"{bag}: not a readable recording \(run_1.mcap: {said}.*mcap recover"):
+        reader.read(reader.items()[0], RNG)
+
+
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
 def test_files_whose_messages_are_packed_name_the_folder_that_says_so(tmp_path, kind):
     make = messages_of(False)
