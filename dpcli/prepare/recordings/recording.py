@@ -17,9 +17,10 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.recordings.bags import BagReader
 from dpcli.prepare.recordings.foxglove import FOXGLOVE_KINDS, as_ros
-from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 from dpcli.prepare.recordings.mcap import McapReader
+from dpcli.prepare.recordings.ros_types import Channel
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -100,7 +101,9 @@ class Recording:
     the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
     """
 
-    def __init__(self, path: Path, reader: Any, topics: Mapping[str, tuple[str | None, int]]) -> None:
+    def __init__(
+        self, path: Path, reader: McapReader | BagReader, topics: Mapping[str, tuple[str | None, int]]
+    ) -> None:
         self.path, self._reader, self.read = path, reader, 0
         self.topics = {
             name: (kind or "several types", count) for name, (kind, count) in topics.items()
@@ -157,15 +160,9 @@ class Recording:
                     decoded = decode(Message(self._content(raw, connection), connection.msgtype, logged))
                 yield decoded
 
-    def _content(self, raw: bytes, connection: Any) -> Any:
-        kind = connection.msgtype
-        if isinstance(self._reader, McapReader):
-            content = self._reader.decode(connection, raw)
-        elif kind in LIVOX_KINDS:
-            content = read_livox(raw, ros1=not self._reader.is2)
-        else:
-            content = self._reader.deserialize(raw, kind)
-        return as_ros(content, kind) if kind in FOXGLOVE_KINDS else content
+    def _content(self, raw: bytes, connection: Channel) -> Any:
+        content = self._reader.decode(connection, raw)
+        return as_ros(content, connection.msgtype) if connection.msgtype in FOXGLOVE_KINDS else content
 
 
 def _unlisted(folder: Path) -> list[str]:
@@ -210,8 +207,7 @@ def _declared(folder: Path) -> dict[str, tuple[str, int]]:
 def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags.typesys  # noqa: F401  # here, where its lack is not taken for damage
     except ImportError:
         raise UsageError("recordings of robots need rosbags: pip install 'dpc-toolkit[recordings]'") from None
     if path.is_dir():  # metadata.yaml names files of the folder; they may be links
@@ -221,18 +217,14 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            files = _plain_mcap(called) if called.is_dir() else [called] if called.suffix == ".mcap" else []
-            if files:
+            declared = {}
+            if files := _plain_mcap(called) if called.is_dir() else [called] if called.suffix == ".mcap" else []:
                 declared = _declared(called) if called.is_dir() else {}
-                reader: Any = McapReader(files)
-                topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
-                for name, (kind, count) in declared.items():
-                    held = topics.get(name, (kind, 0))
-                    topics[name] = held[0], max(held[1], count)
-            else:
-                reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
-                reader.open()
-                topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
+            reader = McapReader(files) if files else BagReader(called)
+            topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
+            for name, (kind, count) in declared.items():
+                held = topics.get(name, (kind, 0))
+                topics[name] = held[0], max(held[1], count)
         try:
             yield Recording(path, reader, topics)
         finally:
