@@ -11,6 +11,7 @@ from typing import Any
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 
 _IDL = re.compile(r"^={80}\nIDL: .*$", re.MULTILINE)
+_NAME = re.compile(r"\w+(?:/\w+)+")  # of a type
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,13 @@ def _typestore(channel: Channel, others: Iterable[Channel]) -> Any:
     if not channel.definition:
         return get_typestore(Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.LATEST)
     store = get_typestore(Stores.EMPTY)  # it holds those that ROS itself defines
-    types: dict[str, Any] = {}
-    for other in others:
+    own, types = _types(channel), {}
+    named = set(_NAME.findall(repr(own)))
+    for other in others if named - own.keys() - store.fielddefs.keys() else ():
         with suppress(Exception):  # what is wrong with a topic that nobody asked for
             found = _types(other) if other.encoding == channel.encoding and other.definition else {}
             types |= {name: one for name, one in found.items() if name not in store.fielddefs}
-    store.register(types | _types(channel))
+    store.register(types | own)
     return store
 
 
