@@ -255,6 +255,10 @@ def _damage_named(path: Path, topic: str = "") -> Iterator[None]:
         raise DataError(f"{error} (topic {topic})" if topic else str(error)) from None
     except DpcError:
         raise
+    except MemoryError:  # of a long recording, or of a count in a damaged one
+        raise DataError(
+            f"{path}: too large for the memory there is, or damaged; free memory, or copy it again"
+        ) from None
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
         tool = _REPAIR_TOOLS.get(".mcap" if _plain_mcap(path) else path.suffix.lower())
