@@ -153,7 +153,8 @@ def _parse(data: bytes, kind: str) -> SimpleNamespace:
         elif isinstance(one, list):
             setattr(told, name, [_parse(value, one[0]) for value in values])
         elif name:
-            setattr(told, name, _value(values[-1], one))
+            merged = isinstance(one, str) and int not in map(type, values)  # a message that came in parts
+            setattr(told, name, _value(b"".join(values) if merged else values[-1], one))
     return told
 
 

@@ -283,6 +283,30 @@ def test_a_fraction_where_foxglove_has_whole_numbers_is_refused(tmp_path, place)
         read(path)
 
 
+def test_a_pose_in_two_parts_is_merged_as_protobuf_does(tmp_path):
+    (frame,) = frames_of(1)
+    parts = [protobuf((1, protobuf((1, 7.0), (2, 8.0)))), protobuf((1, protobuf((3, 9.0))))]
+    path = tmp_path / "run.mcap"
+    raw = cloud(frame, START, "protobuf") + b"".join(protobuf((3, part)) for part in parts)
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    np.testing.assert_allclose(read(path).sequence.points, xyz(frame) + [7, 8, 9], rtol=1e-6)
+
+
+def test_memory_that_ends_is_not_called_a_damaged_message(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+    raw = cloud(frames_of(1)[0], START, "protobuf")
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    reader = RecordedClouds(path)
+    (item,) = reader.items()
+
+    def ends(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("dpcli.prepare.scans.recorded_clouds.cloud_of_message", ends)
+    with pytest.raises(DataError, match="too large for the memory there is, or damaged; free memory"):
+        reader.read(item, RNG)
+
+
 def test_a_point_of_foxglove_that_was_cut_is_named(tmp_path):
     frame = frames_of(1)[0]
     raw = cloud(frame, START, "protobuf").removesuffix(frame.tobytes())
