@@ -77,6 +77,7 @@ def mcap(
     by_channel = b"".join(struct.pack("<HQ", number, count) for number, count in enumerate(counts, 1))
     head = struct.pack("<QHIIIIQQ", len(parts), len(channels), len(channels), 0, 0, 0, 0, 0)
     every = {"schemas": schemas, "channels": lines, "statistics": record(11, head, text(by_channel)), "index": index}
+    every["uncounted"] = record(11, head, text(""))  # statistics that don't tell how many messages a channel has
     summary = b"".join(every[name] for name in layout.summary)
     start = len(data) if summary else 0
     return data + summary + record(2, struct.pack("<QQI", start, 0, 0)) + MAGIC

@@ -75,7 +75,7 @@ def _cameras(recording: Recording, topic: str) -> list[Calibration]:
     if len(nearest) != 1:
         return []
     lens = _lens(recording, nearest[0])
-    found = (calibration_of_message(recording.path, topic, one.content, lens) for one in recording.messages(nearest[0]))
+    found = recording.messages(nearest[0], lambda one: calibration_of_message(recording.path, topic, one.content, lens))
     return [camera for camera in found if camera]
 
 
@@ -86,7 +86,7 @@ def _lens(recording: Recording, info: str) -> str:
     above = "/" + "/".join([*_folder(info)[:-1], "camera_info"])
     if recording.topics.get(above, ("", 0))[0] != "std_msgs/msg/String":
         return ""
-    said = next((str(message.content.data) for message in recording.messages(above)), "")
+    said = next(recording.messages(above, lambda one: str(one.content.data)), "")
     return next(iter(re.findall(r"model=([^;]+)", said)), "")
 
 
@@ -103,7 +103,7 @@ def _raw_units(recording: Recording, topic: str) -> float | None:
     """
     all_units = [name for name in recording.topics if name.endswith(_UNITS)]
     own = [name for name in all_units if topic.startswith(f"{name.removesuffix(_UNITS)}/")]
-    told = {float(message.content.data) for name in own for message in recording.messages(name)}
+    told = {unit for name in own for unit in recording.messages(name, lambda one: float(one.content.data))}
     if len(told) > 1:
         raise DataError(
             f"{recording.path}: {own[0]} changes on the way ({', '.join(f'{value:g}' for value in sorted(told))}); expected"

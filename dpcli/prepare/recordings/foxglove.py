@@ -129,6 +129,8 @@ def _of_json(said: Any, kind: str) -> SimpleNamespace:
 def _json_value(said: Any, one: Any) -> Any:
     if isinstance(one, str):
         return _of_json(said, one)
+    if one is int and isinstance(said, float) and not said.is_integer():
+        raise ValueError(f"{said} stands where Foxglove's messages have whole numbers")
     return base64.b64decode(said, validate=True) if one is bytes else _whole(int(said)) if one is int else one(said)
 
 
@@ -151,7 +153,8 @@ def _parse(data: bytes, kind: str) -> SimpleNamespace:
         elif isinstance(one, list):
             setattr(told, name, [_parse(value, one[0]) for value in values])
         elif name:
-            setattr(told, name, _value(values[-1], one))
+            merged = isinstance(one, str) and int not in map(type, values)  # a message that came in parts
+            setattr(told, name, _value(b"".join(values) if merged else values[-1], one))
     return told
 
 

@@ -4,6 +4,7 @@ ROS or of Foxglove.
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import BEYOND, Cloud, cloud_of_columns
 from dpcli.prepare.decode.calibration import lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
@@ -27,6 +29,7 @@ CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo", *foxglove.CAMERAS)
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
 _PIXELS |= {"mono8": "u1", "z16": "u2"}
+_VECTOR = re.compile(r"((?:n|normals?|v|vel|velocity)[_.]?)([xyz])", re.IGNORECASE)
 _JPEG = b"\xff\xd8\xff"
 _DEPTH_HEADER = struct.Struct("<iff")  # of image_transport's compressedDepth, before the depth: format, two numbers
 
@@ -65,17 +68,37 @@ def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cl
     rows = data[: row_step * height].reshape(height, row_step)[:, : width * step]
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
     columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
+    motion = getattr(content, "pose", None)  # of Foxglove's clouds: to the frame in which they lie
+    if motion is not None and not np.array_equal(motion[:3, :3], np.eye(3)):
+        _turn_vectors(path, columns, motion[:3, :3], keep)
     cloud = cloud_of_columns(path, columns, keep)
     others = [field.name for field in content.fields if fields.get(field.name) is not field]
     cloud.unread += tuple(f"{name} (again)" if name in fields else name for name in others)
     beyond = (len(data) - row_step * height) // max(step, 1)
     cloud.dropped |= {BEYOND: beyond} if beyond else {}
-    motion = getattr(content, "pose", None)  # of Foxglove's clouds: to the frame in which they lie
     if motion is not None:
         with np.errstate(invalid="ignore", over="ignore"):  # of numbers that aren't finite, which are dropped
             moved = cloud.points @ motion[:3, :3].T + motion[:3, 3]
         cloud.points = np.where((cloud.points != 0).any(1, keepdims=True), moved, 0)  # at the origin nothing was seen
     return cloud
+
+
+def _turn_vectors(path: Path, columns: dict[str, np.ndarray], turn: np.ndarray, keep: tuple[str, ...]) -> None:
+    """Turns the normals and velocities of ``keep`` among columns by a rotation f64 (3,3), as their points are.
+
+    Raises DataError where one lacks its other two parts, without which it can't be turned.
+    """
+    kept = [found for name in keep if name in columns and (found := _VECTOR.fullmatch(name))]
+    for stem, axes in sorted({(found[1], "XYZ" if found[2].isupper() else "xyz") for found in kept}):
+        names = [stem + axis for axis in axes]
+        if lacking := [name for name in names if name not in columns]:
+            raise DataError(
+                f"{path}: a cloud's pose turns its points, and can't turn {first_names(names, 3)} with them, since the"
+                f" message has no {' and no '.join(lacking)}; leave them out of --keep-fields"
+            )
+        with np.errstate(invalid="ignore", over="ignore"):  # of numbers that aren't finite
+            turned = np.stack([columns[name].astype(np.float64) for name in names], axis=1) @ turn.T
+        columns |= dict(zip(names, turned.T))
 
 
 def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
-from dpcli.errors import DataError, UsageError
+import yaml
+
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.recordings.bags import BagReader
 from dpcli.prepare.recordings.foxglove import FOXGLOVE_KINDS, as_ros
-from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
 from dpcli.prepare.recordings.mcap import McapReader
+from dpcli.prepare.recordings.ros_types import Channel
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -27,6 +30,7 @@ _UNREAD = re.compile(r"\.(bag|mcap|db3)\.(?!(bag|mcap|db3)$)\w+$", re.IGNORECASE
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
 _REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
+Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True)
@@ -97,10 +101,12 @@ class Recording:
     the files in the folder of a ROS 2 bag that its metadata.yaml doesn't name, so that they aren't read.
     """
 
-    def __init__(self, path: Path, reader: Any, topics: Mapping[str, Any]) -> None:
+    def __init__(
+        self, path: Path, reader: McapReader | BagReader, topics: Mapping[str, tuple[str | None, int]]
+    ) -> None:
         self.path, self._reader, self.read = path, reader, 0
-        self.topics: dict[str, tuple[str, int]] = {
-            name: (info.msgtype or "several types", info.msgcount) for name, info in topics.items()
+        self.topics = {
+            name: (kind or "several types", count) for name, (kind, count) in topics.items()
         }  # name -> (type, number of messages)
         self.unlisted = _unlisted(path) if path.is_dir() else []
 
@@ -132,8 +138,11 @@ class Recording:
         tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
         return f"{said}; if its index is not whole, {tool} makes it" if tool and not held else said
 
-    def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
-        """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
+    def messages(self, topic: str, decode: Callable[[Message], Decoded], stride: int = 1) -> Iterator[Decoded]:
+        """Yields what ``decode`` makes of every ``stride``-th message of a topic, in the order they were recorded.
+
+        Raises DataError at damage, and where a message can't be decoded.
+        """
         connections = [one for one in self._reader.connections if one.topic == topic]
         with _damage_named(self.path):
             raw_messages = self._reader.messages(connections=connections)
@@ -141,23 +150,19 @@ class Recording:
         while True:
             with _damage_named(self.path):
                 found = next(raw_messages, None)
-                if found is None:
-                    return
-                connection, logged, raw = found
-                content = self._content(raw, connection) if self.read % stride == 0 else None
+            if found is None:
+                return
+            connection, logged, raw = found
+            taken = self.read % stride == 0
             self.read += 1
-            if content is not None:
-                yield Message(content, connection.msgtype, logged)
+            if taken:
+                with _damage_named(self.path, topic):
+                    decoded = decode(Message(self._content(raw, connection), connection.msgtype, logged))
+                yield decoded
 
-    def _content(self, raw: bytes, connection: Any) -> Any:
-        kind = connection.msgtype
-        if isinstance(self._reader, McapReader):
-            content = self._reader.decode(connection, raw)
-        elif kind in LIVOX_KINDS:
-            content = read_livox(raw, ros1=not self._reader.is2)
-        else:
-            content = self._reader.deserialize(raw, kind)
-        return as_ros(content, kind) if kind in FOXGLOVE_KINDS else content
+    def _content(self, raw: bytes, connection: Channel) -> Any:
+        content = self._reader.decode(connection, raw)
+        return as_ros(content, connection.msgtype) if connection.msgtype in FOXGLOVE_KINDS else content
 
 
 def _unlisted(folder: Path) -> list[str]:
@@ -181,12 +186,28 @@ def _plain_mcap(folder: Path) -> list[Path]:
     return sorted(listed) if all(one.suffix == ".mcap" for one in listed) else []
 
 
+def _declared(folder: Path) -> dict[str, tuple[str, int]]:
+    """Returns the topics of a ROS 2 bag, name -> (type, number of messages), as its metadata.yaml has them.
+
+    Raises ValueError where it is damaged, or a file that it lists isn't there.
+    """
+    try:
+        told = yaml.safe_load((folder / _METADATA).read_bytes())["rosbag2_bagfile_information"]
+        names = [Path(one).name for one in told["relative_file_paths"]]
+        every = [(one["topic_metadata"], int(one["message_count"])) for one in told["topics_with_message_count"] or ()]
+        topics = {str(topic["name"]): (str(topic["type"]), count) for topic, count in every}
+    except Exception as error:
+        raise ValueError(f"its {_METADATA} is damaged: {type(error).__name__} {error}") from None
+    if lacking := [name for name in names if not (folder / name).exists()]:
+        raise ValueError(f"its {_METADATA} lists files that are not there: {first_names(lacking, _LISTED)}")
+    return topics
+
+
 @contextmanager
 def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags.typesys  # noqa: F401  # here, where its lack is not taken for damage
     except ImportError:
         raise UsageError("recordings of robots need rosbags: pip install 'dpc-toolkit[recordings]'") from None
     if path.is_dir():  # metadata.yaml names files of the folder; they may be links
@@ -196,16 +217,14 @@ def open_recording(path: Path) -> Iterator[Recording]:
                 raise DataError(f"{one}: {reason}; it was not opened")
     with _small_suffix(path) as called:
         with _damage_named(path):
-            if called.suffix == ".mcap" and not called.is_dir():
-                reader: Any = McapReader([called])
-                topics = reader.topics
-            else:
-                reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
-                reader.open()
-                topics = reader.topics
-                if files := _plain_mcap(called):
-                    reader.close()
-                    reader = McapReader(files)
+            declared = {}
+            if files := _plain_mcap(called) if called.is_dir() else [called] if called.suffix == ".mcap" else []:
+                declared = _declared(called) if called.is_dir() else {}
+            reader = McapReader(files) if files else BagReader(called)
+            topics = {name: (info.msgtype, info.msgcount) for name, info in reader.topics.items()}
+            for name, (kind, count) in declared.items():
+                held = topics.get(name, (kind, 0))
+                topics[name] = held[0], max(held[1], count)
         try:
             yield Recording(path, reader, topics)
         finally:
@@ -225,16 +244,29 @@ def _small_suffix(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Turns whatever a parser of recordings raises into a DataError: damaged files make it stumble over anything."""
+def _damage_named(path: Path, topic: str = "") -> Iterator[None]:
+    """Turns whatever a parser of recordings raises into a DataError: damaged files make it stumble over anything.
+
+    topic: the one whose message is decoded, "" where none is yet.
+    """
     try:
         yield
+    except DataError as error:
+        raise DataError(f"{error} (topic {topic})" if topic else str(error)) from None
+    except DpcError:
+        raise
+    except MemoryError:  # of a long recording, or of a count in a damaged one
+        raise DataError(
+            f"{path}: too large for the memory there is, or damaged; free memory, or copy it again"
+        ) from None
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
-        tool = _REPAIR_TOOLS.get(path.suffix.lower())
+        tool = _REPAIR_TOOLS.get(".mcap" if _plain_mcap(path) else path.suffix.lower())
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
+        expected = "expected a ROS 1 bag, a ROS 2 bag, or an MCAP file"
+        if topic:
+            expected, hint = "it is damaged, or the file describes its type wrongly", ""
         if not path.is_dir() and _packs_messages(path.parent):
             hint = f"; as the {_METADATA} beside it says, its messages are packed: name the folder {path.parent}"
-        raise DataError(
-            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file{hint}"
-        ) from None
+        what = f"a message of {topic} can't be decoded" if topic else "not a readable recording"
+        raise DataError(f"{path}: {what} ({said}); {expected}{hint}") from None

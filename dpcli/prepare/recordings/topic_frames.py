@@ -43,10 +43,12 @@ def read_topic(recording: Recording, topic: str, stride: int, decode: Callable[[
     frames: list[Frame] = []
     stamps: list[tuple[int | None, int]] = []
     places: set[str] = set()
-    for message in recording.messages(topic, stride):
-        frames.append(decode(message))
-        stamps.append((message.stamp, message.logged))
-        places.add(message.place)
+    for frame, own, logged, place in recording.messages(
+        topic, lambda one: (decode(one), one.stamp, one.logged, one.place), stride
+    ):
+        frames.append(frame)
+        stamps.append((own, logged))
+        places.add(place)
     declared = recording.topics[topic][1]
     if not frames:
         raise DataError(f"{recording.path}: {topic} declares {counted(declared, 'message')} and holds none")

@@ -68,7 +68,7 @@ class RecordedClouds(OwnScans):
             try:
                 with open_recording(path) as recording:
                     topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
-                    clouds = (cloud_of_message(path, message.content) for message in recording.messages(topic))
+                    clouds = recording.messages(topic, lambda one, path=path: cloud_of_message(path, one.content))
                     first = next((cloud for cloud in clouds if len(cloud.points)), None)
             except DataError:
                 continue  # a bad sample: the next one tells

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from functools import cache
 from itertools import combinations
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.recordings.depth import read_recorded_depth
+from dpcli.prepare.recordings.topic_frames import LACKING
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.mcap_helpers import Layout, cloud, mcap, protobuf
 from tests.support.recording_helpers import START, Messages, write_recording
@@ -26,7 +28,12 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 LOOSE = np.dtype({"names": ["ring", "z", "x", "y"], "formats": ["u1", "<f4", "<f4", "<f4"], "offsets": [0, 2, 7, 11]})
 FOXGLOVE = "foxglove.PointCloud"
 PARTS = ("schemas", "channels", "statistics", "index")
-SUMMARIES = [some for count in range(len(PARTS) + 1) for some in combinations(PARTS, count)]
+SUMMARIES = [
+    tuple(one if one != "statistics" or counted else "uncounted" for one in some)
+    for counted in (True, False)
+    for count in range(len(PARTS) + 1)
+    for some in combinations(PARTS, count)
+]
 LAYOUTS = st.builds(
     Layout,
     chunk=st.integers(0, 3),
@@ -124,14 +131,49 @@ def test_every_layout_and_encoding_holds_what_was_written(tmp_path, encoding, la
         )
 
 
-def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path):
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_types_that_a_description_lacks_are_taken_from_another_one(tmp_path, ends):
     topic, *kind, described = ros_channel(False)
     header = described[: described.index("=" * 80)]
     (frame,) = frames_of(1)
     path = tmp_path / "run.mcap"
+    described = described.replace("\n", ends)
     channels = [(topic, *kind, header), ("/other", *kind, described), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
     path.write_bytes(mcap(channels, [(0, START, ros_cloud(frame, START, False))]))
     np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
+
+
+FIELDS = ["header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "data", "is_dense"]
+
+
+@pytest.mark.parametrize("lacking", [*FIELDS, "stamp", "frame_id", "datatype", "count"])
+def test_messages_whose_type_lacks_a_field_are_read_or_named_with_their_topic(tmp_path, lacking):
+    topic, encoding, name, form, described = ros_channel(False)
+    described = re.sub(rf"^\S+ {lacking}$", "", described, flags=re.MULTILINE)
+    (frame,) = frames_of(1)
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    store.register(typesys.get_types_from_msg(described, name))
+    whole = messages_of(False).cloud(frame, START)
+
+    def without(one):
+        """The message, and those in it, of the types that lack a field."""
+        if isinstance(one, list):
+            return [without(part) for part in one]
+        if not hasattr(one, "__msgtype__"):
+            return one
+        kind = store.types[one.__msgtype__]
+        return kind(**{k: without(v) for k, v in vars(one).items() if k in kind.__dataclass_fields__})
+
+    path = tmp_path / "run.mcap"
+    raw = bytes(store.serialize_cdr(without(whole), name))
+    path.write_bytes(mcap([(topic, encoding, name, form, described)], [(0, START, raw)]))
+    if lacking in ("header", "stamp", "frame_id", "is_dense"):
+        np.testing.assert_array_equal(read(path).sequence.points, xyz(frame))
+        return
+    reader = RecordedClouds(path)
+    with pytest.raises(DataError, match=f"{path}: a message of /points can't be decoded .*{lacking}"):
+        reader.read(reader.items()[0], RNG)
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
@@ -149,6 +191,43 @@ def test_poses_of_clouds_move_their_points_and_returns_that_met_nothing_are_drop
     points = [np.stack([1.0 + t - frame["y"], 2 + frame["x"], 3 + frame["z"]], 1) for t, frame in enumerate(frames)]
     np.testing.assert_allclose(sample.sequence.points, np.concatenate([points[0], points[1][:1]]), rtol=1e-6)
     assert sample.notes == {AT_ORIGIN: 3}
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    turn=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1),
+    stem=st.sampled_from(["normal_", "n", "N", "v", "velocity_"]),
+    kept=st.sets(st.sampled_from("xyz"), min_size=1),
+)
+def test_poses_of_clouds_turn_normals_and_velocities_as_they_turn_what_lies_between_points(tmp_path, turn, stem, kept):
+    axes = "XYZ" if stem == "N" else "xyz"
+    frame = np.zeros(6, np.dtype([(name, "<f4") for name in (*"xyz", *(stem + axis for axis in axes))]))
+    for k, name in enumerate(frame.dtype.names):
+        frame[name][:3] = frame[name][3:] = np.random.default_rng([7, k]).uniform(1, 100, 3)
+    for axis, name in zip("xyz", axes):
+        frame[axis][3:] += frame[stem + name][:3]  # three points, and each where its vector ends
+    path = tmp_path / "run.mcap"
+    raw = cloud(frame, START, "protobuf", ([1.0, 2.0, 3.0], list(turn)))
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    sequence = read(path, keep=tuple(stem + axes["xyz".index(axis)] for axis in sorted(kept))).sequence
+    for axis in kept:
+        name, place = axes["xyz".index(axis)], "xyz".index(axis)
+        ends = sequence.points[:3, place] + sequence.extra[f"field_{stem}{name}"][:3]
+        np.testing.assert_allclose(ends, sequence.points[3:, place], atol=1e-3)
+
+
+def test_a_normal_without_its_other_parts_is_refused_where_a_pose_turns_it(tmp_path):
+    frame = np.ones(3, np.dtype([(name, "<f4") for name in (*"xyz", "normal_x", "normal_y")]))
+    path = tmp_path / "run.mcap"
+    for turn in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]):
+        raw = cloud(frame, START, "protobuf", ([1.0, 2.0, 3.0], turn))
+        path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+        if turn[3]:
+            assert (read(path, keep=("normal_x",)).sequence.extra["field_normal_x"] == 1).all()
+            continue
+        with pytest.raises(DataError, match="can't turn normal_x, normal_y, normal_z .* no normal_z"):
+            reader = RecordedClouds(path, keep=("normal_x",))
+            reader.read(reader.items()[0], RNG)
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
@@ -186,12 +265,46 @@ def test_depth_of_foxglove_with_its_camera(tmp_path, encoding, form):
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_foxglove_messages_that_were_cut_are_named(tmp_path, encoding):
     whole = cloud(frames_of(1)[0], START, encoding)
-    said = "not a readable recording|has fewer|is damaged|bytes"
+    said = "a message of /points can't be decoded .*it is damaged|has fewer|bytes.*/points"
     for kept in range(1, len(whole), 7):
         path = tmp_path / f"{kept}.mcap"
         path.write_bytes(mcap([("/points", encoding, FOXGLOVE, "", "")], [(0, START, whole[:kept])]))
         with pytest.raises(DataError, match=said):
             read(path)
+
+
+@pytest.mark.parametrize("place", ["point_stride", "timestamp"])
+def test_a_fraction_where_foxglove_has_whole_numbers_is_refused(tmp_path, place):
+    said = json.loads(cloud(frames_of(1)[0], START, "json"))
+    said[place] = {"sec": 1.5, "nsec": 0} if place == "timestamp" else 12.7
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap([("/points", "json", FOXGLOVE, "", "")], [(0, START, json.dumps(said).encode())]))
+    with pytest.raises(DataError, match=r"(1.5|12.7) stands where Foxglove's messages have whole numbers"):
+        read(path)
+
+
+def test_a_pose_in_two_parts_is_merged_as_protobuf_does(tmp_path):
+    (frame,) = frames_of(1)
+    parts = [protobuf((1, protobuf((1, 7.0), (2, 8.0)))), protobuf((1, protobuf((3, 9.0))))]
+    path = tmp_path / "run.mcap"
+    raw = cloud(frame, START, "protobuf") + b"".join(protobuf((3, part)) for part in parts)
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    np.testing.assert_allclose(read(path).sequence.points, xyz(frame) + [7, 8, 9], rtol=1e-6)
+
+
+def test_memory_that_ends_is_not_called_a_damaged_message(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+    raw = cloud(frames_of(1)[0], START, "protobuf")
+    path.write_bytes(mcap([("/points", "protobuf", FOXGLOVE, "", "")], [(0, START, raw)]))
+    reader = RecordedClouds(path)
+    (item,) = reader.items()
+
+    def ends(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("dpcli.prepare.scans.recorded_clouds.cloud_of_message", ends)
+    with pytest.raises(DataError, match="too large for the memory there is, or damaged; free memory"):
+        reader.read(item, RNG)
 
 
 def test_a_point_of_foxglove_that_was_cut_is_named(tmp_path):
@@ -235,7 +348,15 @@ def test_damaged_files_are_named(tmp_path, damage, said):
 
 
 @pytest.mark.parametrize("chunk", [0, 2])
-@pytest.mark.parametrize("summary", [(), ("channels", "statistics", "index"), ("schemas", "channels", "statistics")])
+@pytest.mark.parametrize(
+    "summary",
+    [
+        (),
+        ("channels", "statistics", "index"),
+        ("schemas", "channels", "statistics"),
+        ("schemas", "channels", "uncounted"),
+    ],
+)
 def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_path, chunk, summary):
     frames, stamps = frames_of(6), [START + 10**8 * t for t in range(6)]
     make = messages_of(False)
@@ -253,6 +374,61 @@ def test_bags_of_ros_2_may_lack_parts_of_their_index_and_have_several_files(tmp_
     np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
     np.testing.assert_allclose(sample.sequence.time, np.arange(6) / 10)
     assert not sample.notes
+
+
+@pytest.mark.parametrize(
+    ("told", "instead", "said"),
+    [
+        ("storage_identifier: mcap", "storage_identifier: ''", ""),  # as reindexing leaves it
+        ("version: 9", "version: 10", ""),
+        ("message_count: 2", "message_count: 0", ""),
+        ("message_count: 2", "message_count: 3", "lack"),
+        ("  - run.mcap", "  - run.mcap\n  - gone.mcap", "lists files that are not there: gone.mcap"),
+        ("relative_file_paths", "paths", "metadata.yaml is damaged: KeyError 'relative_file_paths'"),
+    ],
+)
+def test_files_of_a_bag_of_ros_2_count_where_its_metadata_says_otherwise(tmp_path, told, instead, said):
+    make = messages_of(False)
+    frames = frames_of(2)
+    content = [("/points", START + t, make.cloud(frame, START + t)) for t, frame in enumerate(frames)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    raw = [ros_cloud(frame, START + t, False) for t, frame in enumerate(frames)]
+    channels = [ros_channel(False), ("/bad", "cdr", "a/msg/B", "ros2msg", "? !")]
+    (bag / "run.mcap").write_bytes(mcap(channels, [(0, START + t, one) for t, one in enumerate(raw)]))
+    metadata = (bag / "metadata.yaml").read_text()
+    assert told in metadata
+    (bag / "metadata.yaml").write_text(metadata.replace(told, instead))
+    if said not in ("", "lack"):
+        with pytest.raises(DataError, match=said):
+            read(bag)
+        return
+    sample = read(bag)
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([xyz(frame) for frame in frames]))
+    assert sample.notes == ({LACKING: 1} if said else {})
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
+def test_the_damaged_one_of_several_files_of_a_bag_is_named(tmp_path, damage):
+    make = messages_of(False)
+    frames = frames_of(4)
+    content = [("/points", START + t, make.cloud(frame, START + t)) for t, frame in enumerate(frames)]
+    bag = write_recording(tmp_path / "run", "mcap", make, content)
+    (bag / "run.mcap").unlink()
+    for part in (0, 1):
+        raw = [(0, START + t, ros_cloud(frames[t], START + t, False)) for t in (2 * part, 2 * part + 1)]
+        data = mcap([ros_channel(False)], raw)
+        if part and damage == "cut":
+            data = data[: len(data) // 2]
+        elif part:
+            at = data.index(frames[3].tobytes())
+            data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+        (bag / f"run_{part}.mcap").write_bytes(data)
+    told = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(told.replace("  - run.mcap\n", "  - run_0.mcap\n  - run_1.mcap\n"))
+    said = "it is cut off" if damage == "cut" else "a chunk is damaged"
+    reader = RecordedClouds(bag)
+    with pytest.raises(DataError, match=rf"{bag}: not a readable recording \(run_1.mcap: {said}.*mcap recover"):
+        reader.read(reader.items()[0], RNG)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
