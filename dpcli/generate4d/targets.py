@@ -115,7 +115,7 @@ class Targets:
 def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
     """Returns the reference view and those of these roles, resized to a longer side of `size` pixels (never enlarged).
 
-    Raises DataError when the reference view is empty in every frame, and for pictures that are a single row or column then.
+    Raises DataError when one of them is empty in every frame, and for pictures that are a single row or column then.
     """
     with ViewsReader(path) as reader:
         header = reader.header
@@ -133,10 +133,10 @@ def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
                 pictures[row, frame] = _resize(reader.rgba(view, frame), width, height)
         factor = np.array([width / header.size[0], height / header.size[1], 1.0])[:, None]
         reference = chosen.index(header.reference)
-        if not pictures[reference, :, :, :, 3].any():
-            raise DataError(
-                f"{path}: the reference view shows nothing in any frame (alpha is zero); prepare the clip again"
-            )
+        for row in (reference, *range(len(chosen))):
+            if not pictures[row, :, :, :, 3].any():
+                which = "the reference view" if row == reference else f"view {chosen[row]} ({header.role[chosen[row]]})"
+                raise DataError(f"{path}: {which} shows nothing in any frame (alpha is zero); prepare the clip again")
         return Targets(
             header.name,
             pictures,

@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -209,9 +210,12 @@ def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
 
 def test_what_is_wrong_is_said(tmp_path, dpc_here):
     views, blank = toy_views(tmp_path / "views.h5"), toy_views(tmp_path / "blank.h5", empty=True)
+    with h5py.File(sided := toy_views(tmp_path / "sided.h5", train=2), "r+") as file:
+        file["rgba"][2] = 0
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
+        (3, "view 2 (train) shows nothing", (sided, "-o", tmp_path / "a.h5", "--prior", "views")),
         (
             3,
             "--prior-model nosuch: no such file",
