@@ -102,7 +102,7 @@ class Targets:
             found = f"reach {reach:.2g} from the world's origin" if reach > _LARGE else "be tiny"
             log.warn(
                 f"{where}: at the origin's distance the picture is {2 * half:.2g} units wide, and the object seems to {found}:"
-                f" the fit will be poor; {advice} (for a clip, --radius and --fovy of `dpc prepare video` say where the camera is)"
+                f" the fit will suffer; {advice} (for a clip, --radius and --fovy of `dpc prepare video` say where the camera is)"
             )
 
     def picture(self, view: int, frame: int) -> np.ndarray:
