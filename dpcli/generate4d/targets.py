@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from dpcli.errors import DataError
+from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsReader
+
+_OBJECT_RADIUS = 0.75  # of the sphere around the origin that an object fits, as `docs/format.md` says
+_LARGE = 3 * _OBJECT_RADIUS  # an object that reaches farther from the origin is fitted visibly worse
+_SMALL = 0.05  # half a picture's width at the object, world units: below it pixels are smaller than Gaussians can be
 
 
 @dataclass
@@ -69,6 +74,37 @@ class Targets:
             matrices[:, :2] /= shrink
         return chosen, matrices, torch.from_numpy(self.world_to_camera[views]).float()
 
+    def object_reach(self) -> tuple[float, float]:
+        """Returns how far the object seems to reach from the world's origin, and half the picture's longer side: world units.
+
+        Both are those of the reference view at the origin's depth, which is negative behind the camera; the first is of
+        all frames together.
+        """
+        lens, pose = self.intrinsics[self.reference], self.world_to_camera[self.reference]
+        alpha, depth = self.pictures[self.reference, ..., 3].amax(0).float().numpy(), float(pose[2, 3])
+        rows, columns = np.nonzero(alpha > min(0.5, 0.5 * float(alpha.max())))
+        low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+        focal = lens[[0, 1], [0, 1]]
+        middle = ((low + high) / 2 - lens[:2, 2]) / focal * depth - pose[:2, 3]
+        reach = np.linalg.norm(middle) + (abs(depth) * (high - low) / 2 / focal).max()
+        return float(reach), float((depth * np.array(self.size) / 2 / focal).max())
+
+    def check_world(self, where: object) -> None:
+        """Warns of a world in another unit, or with its origin elsewhere, than the rates, sizes and new cameras of a fit expect.
+
+        Raises DataError, starting with `where`, when the origin isn't in front of the reference camera.
+        """
+        reach, half = self.object_reach()
+        advice = f"scale and shift the world, so that the object fits a sphere of radius {_OBJECT_RADIUS:g} around its origin"
+        if half <= 0:
+            raise DataError(f"{where}: the world's origin is not in front of the reference camera; {advice}")
+        if reach > _LARGE or half < _SMALL:
+            found = f"reach {reach:.2g} from the world's origin" if reach > _LARGE else "be tiny"
+            log.warn(
+                f"{where}: at the origin's distance the picture is {2 * half:.2g} units wide, and the object seems to {found}:"
+                f" the fit will suffer; {advice} (for a clip, --radius and --fovy of `dpc prepare video` say where the camera is)"
+            )
+
     def picture(self, view: int, frame: int) -> np.ndarray:
         """Returns a picture f32 (H,W,4) with straight color, 0..1."""
         value = self.pictures[view, frame].float().numpy().copy()
@@ -79,7 +115,7 @@ class Targets:
 def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
     """Returns the reference view and those of these roles, resized to a longer side of `size` pixels (never enlarged).
 
-    Raises DataError when the reference view is empty in every frame, and for pictures that are a single row or column then.
+    Raises DataError when one of them is empty in every frame, and for pictures that are a single row or column then.
     """
     with ViewsReader(path) as reader:
         header = reader.header
@@ -97,10 +133,10 @@ def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
                 pictures[row, frame] = _resize(reader.rgba(view, frame), width, height)
         factor = np.array([width / header.size[0], height / header.size[1], 1.0])[:, None]
         reference = chosen.index(header.reference)
-        if not pictures[reference, :, :, :, 3].any():
-            raise DataError(
-                f"{path}: the reference view shows nothing in any frame (alpha is zero); prepare the clip again"
-            )
+        for row in (reference, *range(len(chosen))):
+            if not pictures[row, :, :, :, 3].any():
+                which = "the reference view" if row == reference else f"view {chosen[row]} ({header.role[chosen[row]]})"
+                raise DataError(f"{path}: {which} shows nothing in any frame (alpha is zero); prepare the clip again")
         return Targets(
             header.name,
             pictures,

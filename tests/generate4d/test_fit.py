@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -127,6 +128,26 @@ def test_an_object_that_faded_away_is_told(logit, told, capsys):
     assert ("the most opaque has 0.018" in capsys.readouterr().err) == told
 
 
+@pytest.mark.parametrize(
+    "scale, shift, told",
+    [(1, 0, ""), (0.1, 0, ""), (3, 0, "reach "), (1e3, 0, "reach "), (1e-3, 0, "be tiny"), (1, 9, "reach ")],
+)
+def test_a_world_of_another_unit_or_origin_is_told(scale, shift, told, tmp_path, capsys):
+    """The same pictures, in a world that another program measured otherwise: what is seen of it scales along."""
+    targets = fit._load(toy_views(tmp_path / "views.h5"), FitConfig(size=32), Supervision())
+    reach, half = targets.object_reach()
+    assert 0.5 < reach < 1.1 and half == pytest.approx(2 * np.tan(DEFAULT_FOVY / 2))
+    targets.world_to_camera[:, :3, 3] *= scale
+    assert targets.object_reach() == pytest.approx((scale * reach, scale * half))
+    targets.world_to_camera[:, 1, 3] += shift
+    targets.check_world("views.h5")
+    said = capsys.readouterr().err
+    assert (told in said and "views.h5" in said) if told else not said
+    targets.world_to_camera[:, 2, 3] *= -1
+    with pytest.raises(DataError, match=r"views.h5: the world's origin is not in front of the reference camera"):
+        targets.check_world("views.h5")
+
+
 def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
     """A ball seen once, which is a ball from the side as well, neither a cloud behind it nor a splinter."""
     path = tmp_path / "ball.h5"
@@ -189,9 +210,12 @@ def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
 
 def test_what_is_wrong_is_said(tmp_path, dpc_here):
     views, blank = toy_views(tmp_path / "views.h5"), toy_views(tmp_path / "blank.h5", empty=True)
+    with h5py.File(sided := toy_views(tmp_path / "sided.h5", train=2), "r+") as file:
+        file["rgba"][2] = 0
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
+        (3, "view 2 (train) shows nothing", (sided, "-o", tmp_path / "a.h5", "--prior", "views")),
         (
             3,
             "--prior-model nosuch: no such file",

@@ -174,7 +174,7 @@ def _choose_metrics(asked: Sequence[str] | None, predicted: Source, truth: Sourc
     possible += ["silhouette_iou"] if silhouettes else []
     possible += [name for name, key in zip(SCENE_METRICS, ("part", "track", "track")) if key in fields]
     if asked is None:
-        return possible
+        return [name for name in possible if name not in SCENE_METRICS or _is_known(name, truth)]
     for name in asked:
         if name == "psnr_foreground" and not truth.has_alpha:
             raise DataError(f"{truth.path}: no alpha, so the object's pixels are unknown; leave out psnr_foreground")
@@ -191,6 +191,17 @@ def _choose_metrics(asked: Sequence[str] | None, predicted: Source, truth: Sourc
                 f"animal write them; leave {name} out of --metrics"
             )
     return list(asked)
+
+
+def _is_known(name: str, truth: ViewsSource) -> bool:
+    """Returns whether the truth's data sets for a scene's metric hold anything, and warns where they don't."""
+    track, part = truth.reader.track, truth.reader.part
+    known = bool((part >= 0).any()) if name == "parts" else bool(track.shape[1])
+    if not known:
+        log.warn(
+            f"{truth.path}: {'no surface point has a known part' if track.shape[1] else 'no surface points'}, {name} is left out"
+        )
+    return known
 
 
 def _scene_scores(predicted: Source, truth: Source, names: Sequence[str], seed: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -129,11 +129,12 @@ class FramePass:
     def _numbered_otherwise(self, ours: int, theirs: int) -> str:
         """Returns, in words, the first frames that the names of both sides number in different steps; "" without such.
 
-        Of sides that have not equally many, the names count themselves: the first frame may be what one lacks.
+        Of sides that have not equally many, the names count themselves: the first frame may be what one lacks. Where only one
+        side has numbers, these should be even.
         """
         own, other = (s.numbers[i] if s.numbers else None for s, i in ((self.predicted, ours), (self.truth, theirs)))
         if own is None or other is None:
-            return ""
+            return _gap_in(own or other or [])
         first = (own[0], other[0]) if len(own) == len(other) else (0, 0)
         odd = [k for k, (a, b) in enumerate(zip(own, other)) if a - first[0] != b - first[1]]
         return f"{own[odd[0]]} with {other[odd[0]]}" if odd else ""
@@ -244,6 +245,17 @@ class FramePass:
         if self.hollow:
             lines.append(f"Predicted pictures without an object (alpha 0 everywhere): {self.hollow}.")
         return lines
+
+
+def _gap_in(numbers: Sequence[int]) -> str:
+    """Returns, in words, the first two rising numbers that lie at least twice as far apart as the nearest; "" without such.
+
+    >>> _gap_in([0, 1, 3, 4]), _gap_in([0, 5, 10])
+    ('3 right after 1', '')
+    """
+    steps = np.diff(numbers)
+    wide = np.flatnonzero(steps >= 2 * steps.min()) if len(steps) else []
+    return f"{numbers[wide[0] + 1]} right after {numbers[wide[0]]}" if len(wide) else ""
 
 
 def _red_and_blue_swapped(predicted: np.ndarray, truth: np.ndarray) -> bool:

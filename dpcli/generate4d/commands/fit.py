@@ -70,6 +70,7 @@ def fit_scene(
                 write_preview(read_scene(Path(output)), _load(path, config, supervision), picture)
             return
         targets = _load(path, config, supervision)
+        targets.check_world(views)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
         prior, shape = (
             _load_prior(supervision, targets, device),

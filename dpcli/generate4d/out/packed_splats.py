@@ -15,6 +15,7 @@ from dpcli.generate4d.out.splat_files import Splats
 from dpcli.runtime.whole_file import write_whole
 
 _BITS = (16, 12, 8, 4)  # of 24 a coordinate, behind the point: steps of 1/65536, of 1/4096 ...
+_LOG_SIZES = -10.0, 5.95  # logarithms of the least and the largest size, which is written as a byte of sixteenths
 _REACH = 120.0  # units up to which the finest do, which end at 128; each other ones 16 times as far
 
 
@@ -30,14 +31,21 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
 def write_spz(path: Path, splats: Splats) -> None:
     """Writes one .spz of version 3: 24 bits a coordinate, a byte for each size, color and opacity, 4 for the orientation.
 
-    The format's axes are x right, y up, z back, as the scene's own are. Raises DataError when it can't be written or gsply
-    is not installed.
+    The format's axes are x right, y up, z back, as the scene's own are. Raises DataError when it can't be written, of
+    coordinates and sizes that the format doesn't hold, or when gsply is not installed.
     """
     gsply = _gsply(path)
     farthest = float(np.abs(splats.mean).max())
     bits = next((bits for bits in _BITS if farthest < _REACH * 2 ** (_BITS[0] - bits)), None)
     if bits is None:
         raise DataError(f"{path}: .spz holds no coordinate of {farthest:g}; write --as compressed.ply or ply")
+    longest = splats.log_scale.max(1)
+    if longest.max() > _LOG_SIZES[1] or np.median(longest) < _LOG_SIZES[0]:
+        bounds, own = np.exp(_LOG_SIZES), np.exp([longest.min(), longest.max()])
+        raise DataError(
+            f"{path}: .spz holds sizes of {bounds[0]:.2g} to {bounds[1]:.3g}, but the Gaussians have {own[0]:.2g} to {own[1]:.3g};"
+            " write --as compressed.ply or ply"
+        )
     packed = _written(lambda place: gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits), ".spz")
     write_whole(path, gzip.compress(gzip.decompress(packed), mtime=0))  # equal scenes give equal bytes
 

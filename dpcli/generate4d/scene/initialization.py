@@ -41,8 +41,18 @@ def first_points(
         shape = shape or ShapeGuidance(Inflated(), targets)
         points, colors = sample_surface(shape.layers[frame], shape.camera, config.gaussians, rng)
     else:
-        pictures = [targets.picture(view, frame) for view in range(targets.num_views)]
-        points, colors = carve_hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
+        shown = [view for view in range(targets.num_views) if (targets.pictures[view, frame, ..., 3] > 0.5).any()]
+        if not shown:
+            clearest = float(targets.pictures[:, frame, ..., 3].max())
+            raise DataError(
+                f"the object is too clear: no alpha of the frame to start from is above {clearest:.2f}, expected 0.5; take --set"
+                " start=sphere"
+            )
+        pictures = [
+            targets.picture(view, frame) for view in shown
+        ]  # where it has left a picture, that one carves nothing
+        cameras = targets.intrinsics[shown], targets.world_to_camera[shown]
+        points, colors = carve_hull(pictures, *cameras, config.gaussians, rng)
     return torch.from_numpy(points), torch.from_numpy(colors)
 
 

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+NEAREST = 0.1  # of the camera's distance: no layer is nearer, where a wide picture tells of an object around the camera
 INTERVALS = 2  # K, intervals of a ray: nine rays in ten that hit an animal need one, nearly all others two
 
 

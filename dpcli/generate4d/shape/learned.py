@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dpcli.generate4d.shape.layers import INTERVALS, Camera, ShapeLayers
+from dpcli.generate4d.shape.layers import INTERVALS, NEAREST, Camera, ShapeLayers
 from dpcli.generate4d.shape.model_file import DEFAULT, load_shape_model
 from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.silhouette import ball_thickness
@@ -191,7 +191,8 @@ def _expand(
     unit = place.side * camera.distance / camera.intrinsics[0, 0]
     layers = _empty(picture, camera)
     values = grown[0].numpy()[(slice(None), *own)]
-    layers.depth[:, rows, columns] = camera.distance + unit * _in_order(values[:4])
+    depth = camera.distance + unit * _in_order(values[:4])
+    layers.depth[:, rows, columns] = np.maximum(depth, NEAREST * camera.distance)
     layers.presence[1, rows, columns] = values[4] * picture[3, rows, columns]
     return ShapeLayers(layers.depth, layers.presence, layers.color, confidence)
 

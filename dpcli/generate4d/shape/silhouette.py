@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dpcli.generate4d.shape.layers import INTERVALS, Camera, ShapeLayers
+from dpcli.generate4d.shape.layers import INTERVALS, NEAREST, Camera, ShapeLayers
 
 _FAR = 1e9  # squared pixels, farther than anything in a picture
 _BLUR = 4  # pixels, as far as a Gaussian of one pixel reaches
@@ -52,7 +52,7 @@ class Inflated:
 def _around_middle(picture: np.ndarray, camera: Camera, half: np.ndarray) -> ShapeLayers:
     """Returns layers about the origin's distance; half: half the thickness (H,W) as a share of that distance."""
     middle = camera.distance
-    pair = np.stack([middle * (1 - half), middle * (1 + half)])
+    pair = np.stack([middle * np.maximum(1 - half, NEAREST), middle * (1 + half)])
     presence = np.zeros((INTERVALS, *half.shape), np.float32)
     presence[0] = picture[3]
     color = np.broadcast_to(picture[:3], (2 * INTERVALS, *picture[:3].shape))

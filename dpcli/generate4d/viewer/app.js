@@ -16,6 +16,8 @@ class App extends Stage {
   constructor(header, scene) {
     super($("canvas"), header.camera.fovy, scene.timeline);
     Object.assign(this, { header, scene, hidden: new Set() });
+    const { radius } = header.camera;  // of a scene in any unit, or seen through a long lens
+    this.radii = [Math.min(this.radii[0], radius / 40), Math.max(this.radii[1], 50 * radius)];
     Object.assign(this.state, { color: "appearance", background: "white", turn: false, trails: false, input: true, ...this.home() });
     this.painter = this.painterOf(this.canvas);
     this.trails = new Trails($("trails"), scene);

@@ -9,7 +9,7 @@ void main() {
   vec3 p = rotation * center + shift;
   tint = color;
   float reach = sqrt(max(2.0 * log(255.0 * color.a), 0.0));
-  if (p.z < 0.02 || reach == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
+  if (p.z < 0.01 || reach == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
   vec2 limit = 1.3 * 0.5 * size / focal;
   vec2 t = clamp(p.xy / p.z, -limit, limit);
   mat3 jacobian = mat3(focal.x / p.z, 0.0, 0.0, 0.0, focal.y / p.z, 0.0, -focal.x * t.x / p.z, -focal.y * t.y / p.z, 0.0);

@@ -345,6 +345,28 @@ def test_parts_and_tracks_need_no_pictures(tmp_path: Path) -> None:
     assert "k-means on positions" in text and "no motion" in text and "EPE (m)" in text and "PSNR" not in text
 
 
+@pytest.mark.parametrize(
+    "points, known, names",
+    [(50, False, {"tracks", "surface"}), (0, True, set()), (50, True, {"parts", "tracks", "surface"})],
+)
+def test_a_truth_whose_points_tell_nothing_costs_no_other_metric(points, known, names, tmp_path: Path, capsys) -> None:
+    scene = toy_scene(frames=3)
+    write_scene(tmp_path / "scene.h5", scene, source="toy")
+    lens, pose = scene.camera_intrinsics[:1], scene.camera_world_to_camera[:1]
+    header = ViewsHeader("toy", lens, pose, scene.time, ["reference"], 0, scene.size)
+    part = scene.part[:points] if known else np.full(points, -1, np.int16)
+    with ViewsWriter(tmp_path / "truth.h5", header, track=scene.frame_mean[:, :points], part=part) as writer:
+        for frame in range(3):
+            writer.add(0, frame, np.full((64, 64, 4), 255, np.uint8))
+    report = evaluate_video(tmp_path / "scene.h5", tmp_path / "truth.h5")
+    assert {"psnr", "ssim"} < set(report.names) and set(report.scene) == names
+    said = capsys.readouterr().err
+    assert all((f"{name} is left out" in said) == (name not in names) for name in ("parts", "tracks", "surface"))
+    if "parts" not in names:
+        with pytest.raises(DataError, match="parts: no surface point"):
+            evaluate_video(tmp_path / "scene.h5", tmp_path / "truth.h5", metrics=("parts",))
+
+
 def test_a_scene_is_rendered_at_the_truths_cameras_and_times(tmp_path: Path) -> None:
     scene, views = scene_views(tmp_path)
     found = json.loads(run(scene, "--truth", views, "--json").stdout)

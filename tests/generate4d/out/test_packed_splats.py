@@ -147,6 +147,22 @@ def test_far_coordinates_are_not_wrapped(scene, tmp_path, place):
         write_spz(tmp_path / "b.spz", replace(far, mean=np.full_like(far.mean, 1e7)))
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e-2, 1.0, 1e3, 1e4])
+def test_sizes_of_any_unit_are_kept_or_refused(unit, scene, tmp_path):
+    splats = Splats.of(scene)
+    other = replace(splats, mean=splats.mean * np.float32(unit), log_scale=splats.log_scale + np.float32(np.log(unit)))
+    if unit in (1e-4, 1e4):
+        with pytest.raises(
+            DataError, match=r"a.spz: .spz holds sizes of 4.5e-05 to 384, but the Gaussians have .*; write --as"
+        ):
+            write_spz(tmp_path / "a.spz", other)
+        return
+    write_spz(tmp_path / "a.spz", other)
+    read, longest = _read_spz(tmp_path / "a.spz"), other.log_scale.max(1)
+    np.testing.assert_allclose(read["log_scale"].max(1), np.maximum(longest, -10), atol=1 / 31)  # few are smaller
+    np.testing.assert_allclose(read["mean"], other.mean, atol=max(1e-5, 1e-4 * unit))
+
+
 @pytest.mark.parametrize(("write", "suffix"), [(write_spz, "spz"), (write_compressed_ply, "compressed.ply")])
 def test_equal_scenes_give_equal_bytes_and_a_missing_library_is_named(write, suffix, scene, tmp_path, monkeypatch):
     for name in "ab":

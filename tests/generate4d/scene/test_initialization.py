@@ -11,9 +11,10 @@ import torch
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.scene.canonical_gaussians import NAMES, CanonicalGaussians
-from dpcli.generate4d.scene.initialization import carve_hull, sample_sphere
+from dpcli.generate4d.scene.initialization import carve_hull, first_points, sample_sphere
 from dpcli.generate4d.scene.losses import picture_loss, thickness_loss
 from dpcli.generate4d.shape.silhouette import ball_thickness
+from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_pose, pinhole
 
 RNG = np.random.default_rng(0)
@@ -51,6 +52,25 @@ def test_the_hull_is_inside_every_silhouette_and_takes_the_near_color():
     off = np.roll(_disc(64, 4), 28, axis=0)
     with pytest.raises(DataError, match="no point in common"):
         carve_hull([_disc(64, 4), off], intrinsics, side, 100, RNG)
+
+
+@pytest.mark.parametrize("alpha, views", [((1, 1, 1), 3), ((1, 0, 1), 2), ((1, 0.4, 0), 1), ((0.4, 0.2, 0), 0)])
+def test_a_view_that_the_object_has_left_carves_nothing(alpha, views):
+    """Three views of a ball in the frame to start from; in some it isn't seen, or but faintly."""
+    pictures = torch.from_numpy(np.stack([_disc(64, 15)[None] * [1, 1, 1, clear] for clear in alpha])).half()
+    poses = np.stack([orbit_pose(azimuth, 0) for azimuth in (0.0, 1.5, 3.0)])
+    targets = Targets("ball", pictures, np.stack([pinhole(np.deg2rad(49.1), 64, 64)] * 3), poses, np.zeros(1), 0)
+    config = replace(QUICK, gaussians=300)
+    if not views:
+        with pytest.raises(DataError, match=r"is above 0\.40, expected 0\.5; take --set start=sphere"):
+            first_points("hull", config, targets, np.random.default_rng(0))
+        return
+    points, _ = first_points("hull", config, targets, np.random.default_rng(0))
+    assert len(points) == 300
+    for clear, pose in zip(alpha, poses):
+        camera = points.numpy() @ pose[:3, :3].T + pose[:3, 3]
+        seen = np.hypot(*(camera[:, :2] / camera[:, 2:] * targets.intrinsics[0, 0, 0]).T)
+        assert (seen.max() < 16) == (clear == 1)
 
 
 def test_two_views_at_a_right_angle_make_a_rod_round_not_square():

@@ -13,6 +13,7 @@ from dpcli.generate4d.shape.learned import Network, choose_length, lengthened
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.silhouette import Inflated
+from dpcli.generate4d.shape.splats import splats_of
 from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.runtime.weights import save_weights
 
@@ -128,3 +129,13 @@ def test_a_network_that_names_lengths_goes_through_a_file(tmp_path):
     save_shape_model(tmp_path / "x.safetensors", ShapeNetwork(config).eval(), {"size": 32, "confidence": [0.0, 2.0]})
     found = Network(str(tmp_path / "x.safetensors")).layers(np.stack([_disc(50, 40, 25)] * 2), _camera())
     assert all((np.diff(layers.depth, axis=0) >= 0).all() and np.isfinite(layers.depth).all() for layers in found)
+
+
+@pytest.mark.parametrize("fovy", [0.5, 1.6, 2.2, 2.8])
+def test_a_wide_picture_puts_nothing_behind_the_camera(fovy, weights):
+    """Thickness is as many pixels as the disc's radius, more than the focal length where the picture is wide."""
+    pictures, camera = np.stack([_disc(48, 48, 44)]), Camera(pinhole(fovy, 96, 96), orbit_pose(0.4, 0.1, 3.0))
+    for prior in (Inflated(), Network(str(weights))):
+        (layers,) = prior.layers(pictures, camera)
+        assert layers.depth[:, layers.presence[0] > 0.5].min() >= 0.29
+        assert len(splats_of(layers, camera).mean)

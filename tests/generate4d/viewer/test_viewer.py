@@ -100,6 +100,27 @@ def test_a_browser_draws_what_our_rasterizer_draws(scene, page, tmp_path):
 
 
 @needs_browser
+@pytest.mark.parametrize(("unit", "radius"), [(1000.0, 2000.0), (0.01, 0.02), (1.0, 150.0)])
+def test_a_page_opens_where_the_camera_stands(unit, radius, scene, tmp_path):
+    """Of scenes in another unit, and of one seen from afar through a long lens."""
+    pose, fovy = orbit_pose(0.4, 0.2, radius), 2 * np.arctan(np.tan(DEFAULT_FOVY / 2) * 2 * unit / radius)
+    other = replace(
+        scene,
+        mean=scene.mean * np.float32(unit),
+        frame_mean=scene.frame_mean * np.float32(unit),
+        log_scale=scene.log_scale + np.float32(np.log(unit)),
+        camera_world_to_camera=np.stack([pose] * 2),
+        camera_intrinsics=np.stack([pinhole(fovy, *scene.size)] * 2),
+    )
+    write_page(other, tmp_path / "other.html", title="other")
+    shown = show(tmp_path / "other.html", "time=0.5&controls=0", tmp_path)
+    ours = Renderer(other).picture(Shot(0.5, pose, pinhole(fovy, WIDTH, HEIGHT), (WIDTH, HEIGHT)), Look())
+    difference = np.abs(ours.astype(int) - shown.pixels)
+    assert (ours != ours[0, 0]).any(-1).mean() > 0.1 and difference.mean() < 0.5
+    assert np.quantile(difference, 0.999) <= 12
+
+
+@needs_browser
 def test_without_webgl_a_canvas_shows_the_same(scene, page, tmp_path):
     shown = show(page, "time=0.5&azimuth=-20&elevation=10&color=rigid&controls=0&renderer=2d", tmp_path)
     assert shown.state == "ready" and 'data-renderer="2d"' in shown.page

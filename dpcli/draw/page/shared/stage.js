@@ -17,11 +17,11 @@ function cameraOf(state, fovy, canvas) {
 // Matrices are columns in GLSL.
 const asColumns = (R) => [R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]];
 
-// Adds azimuth, elevation, radius and target to the state; `home()` says where the camera begins.
+// Adds azimuth, elevation, radius and target to the state; `home()` says where the camera begins. `radii`: least and largest radius.
 class Stage extends Player {
   constructor(canvas, fovy, timeline) {
     super(timeline);
-    Object.assign(this, { canvas, fovy, spin: [0, 0], pace: [0, 0] });
+    Object.assign(this, { canvas, fovy, spin: [0, 0], pace: [0, 0], radii: [0.05, 100] });
   }
 
   get camera() { return cameraOf(this.state, this.fovy, this.canvas); }
@@ -29,7 +29,7 @@ class Stage extends Player {
   change(values) {
     const state = Object.assign(this.state, values);
     state.elevation = Math.min(Math.max(state.elevation, -89.9 * DEGREE), 89.9 * DEGREE);
-    state.radius = Math.min(Math.max(state.radius, 0.05), 100);
+    state.radius = Math.min(Math.max(state.radius, this.radii[0]), this.radii[1]);
     super.change({});
   }
 

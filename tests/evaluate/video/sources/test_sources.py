@@ -145,6 +145,20 @@ def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list,
             evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",))
 
 
+@pytest.mark.parametrize(
+    "numbers, told", [([0, 1, 3, 4], "3 right after 1"), ([7, 9, 11, 13], ""), ([0, 3, 7, 10], ""), ([4], "")]
+)
+def test_a_gap_in_the_names_is_told_where_the_other_side_has_none(tmp_path: Path, numbers: list, told: str) -> None:
+    (tmp_path / "a").mkdir()
+    for number in numbers:
+        Image.new("RGB", (16, 16), (number, 0, 0)).save(tmp_path / "a" / f"{number:03}.png")
+    np.save(tmp_path / "all.npy", np.zeros((5, 16, 16, 3), np.uint8))
+    np.save(tmp_path / "as_many.npy", np.zeros((len(numbers), 16, 16, 3), np.uint8))
+    for pair in (("a", "all.npy"), ("all.npy", "a"), ("a", "as_many.npy")):
+        notes = " ".join(evaluate_video(*(tmp_path / x for x in pair), metrics=("psnr",), intersect=True).notes)
+        assert (f"({told})" in notes) if told else "number them otherwise" not in notes
+
+
 @pytest.mark.parametrize("cut_out", [(), (0,), (1,), (0, 1, 2)])
 def test_a_folder_has_alpha_where_any_of_its_pictures_has(tmp_path: Path, cut_out: tuple) -> None:
     for frame in range(3):
