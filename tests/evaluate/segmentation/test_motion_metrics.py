@@ -8,6 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from dpcli.cli.app import app
@@ -89,6 +90,9 @@ def test_rotation_angle(angle: float) -> None:
     first = rotation(rng)
     second = first @ rotation(rng, angle)
     assert rotation_angle(first[None], second[None])[0] == pytest.approx(angle, abs=1e-7)
+    many = Rotation.random(200, random_state=0)  # rounding takes some half turns' chords above 1
+    turned = Rotation.from_rotvec(angle * Rotation.random(200, random_state=1).apply([1.0, 0, 0])) * many
+    assert rotation_angle(many.as_matrix(), turned.as_matrix()) == pytest.approx(np.full(200, angle), abs=1e-7)
 
 
 def test_part_motions_by_hand() -> None:
