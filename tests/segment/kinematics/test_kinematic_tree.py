@@ -9,7 +9,7 @@ from dpcli.errors import DataError
 from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories
-from dpcli.segment.kinematics.registration import Registration
+from dpcli.segment.kinematics.registration import Registration, motion_twist, relative_registration, twist_motion
 from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
@@ -179,3 +179,30 @@ def test_a_plate_has_its_normal_and_both_edges_as_directions():
     found = directions_and_edges(plate)
     assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
     assert len(distinct_directions(found)) == 3
+
+
+def test_the_errors_of_two_motions_make_those_of_the_motion_between_them():
+    from scipy.spatial.transform import Rotation
+
+    rng, draws = np.random.default_rng(2), 4000
+    known, erring = [], []
+    for _ in range(2):
+        motion = np.tile(np.eye(4), (3, 1, 1))
+        motion[:, :3, :3] = Rotation.random(3, random_state=rng.integers(99)).as_matrix()
+        motion[:, :3, 3] = rng.normal(size=(3, 3))
+        root = 1e-3 * rng.normal(size=(3, 6, 6))
+        known.append(Registration(motion, rng.normal(size=3), 1.0, root @ root.transpose(0, 2, 1)))
+        twist = np.einsum("tij,ntj->nti", root, rng.normal(size=(draws, 3, 6)))
+        turn, center = Rotation.from_rotvec(twist[..., :3].reshape(-1, 3)).as_matrix(), known[-1].center
+        moved = np.tile(np.eye(4), (draws, 3, 1, 1))
+        moved[..., :3, :3] = turn.reshape(draws, 3, 3, 3)
+        moved[..., :3, 3] = center + twist[..., 3:] - moved[..., :3, :3] @ center
+        np.testing.assert_allclose(twist_motion(twist, center), moved, atol=1e-12)
+        np.testing.assert_allclose(motion_twist(moved, center), twist, atol=1e-12)
+        erring.append(motion @ moved)
+    found = relative_registration(*known)
+    np.testing.assert_allclose(known[0].motion @ found.motion, known[1].motion, atol=1e-12)
+    error = motion_twist(np.linalg.inv(found.motion) @ np.linalg.inv(erring[0]) @ erring[1], known[1].center)
+    drawn = np.einsum("nti,ntj->tij", error, error) / draws
+    scale = np.sqrt(np.einsum("tii->ti", found.covariance))
+    np.testing.assert_allclose((drawn - found.covariance) / scale[:, None] / scale[..., None], 0, atol=0.1)
