@@ -9,7 +9,13 @@ from dpcli.errors import DataError
 from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories
-from dpcli.segment.kinematics.registration import Registration, motion_twist, relative_registration, twist_motion
+from dpcli.segment.kinematics.registration import (
+    Registration,
+    motion_twist,
+    register,
+    relative_registration,
+    twist_motion,
+)
 from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
@@ -206,3 +212,25 @@ def test_the_errors_of_two_motions_make_those_of_the_motion_between_them():
     drawn = np.einsum("nti,ntj->tij", error, error) / draws
     scale = np.sqrt(np.einsum("tii->ti", found.covariance))
     np.testing.assert_allclose((drawn - found.covariance) / scale[:, None] / scale[..., None], 0, atol=0.1)
+
+
+def test_how_surely_motions_are_known_is_the_same_in_any_place_pose_and_unit():
+    rng, turns = np.random.default_rng(3), [about((0, 0.6, 0.8), 0.5 * t, (1, 2, 3)) for t in range(3)]
+    clouds = [_surface(rng, 200, np.ones(3)) + rng.normal(0, 0.01, (200, 3)) for _ in turns]
+    still = register(clouds, np.tile(np.eye(4), (3, 1, 1)), np.random.default_rng(0))
+    for unit in (1.0, 50.0):
+        motion = np.array(turns)
+        motion[:, :3, 3] *= unit
+        carried = [unit * cloud @ m[:3, :3].T + m[:3, 3] for cloud, m in zip(clouds, motion)]
+        found = register(carried, motion, np.random.default_rng(0))
+        lengths = np.repeat([1, unit], 3)
+        np.testing.assert_allclose(
+            found.covariance, still.covariance * lengths[:, None] * lengths, rtol=1e-2, atol=1e-9
+        )
+        assert found.size == pytest.approx(unit * np.linalg.norm(np.std(np.concatenate(clouds), 0)))
+        np.testing.assert_allclose(found.center, unit * np.concatenate(clouds).mean(0), atol=1e-6 * unit)
+    clouds[1] = clouds[1][:3]  # which say nothing
+    found = register(clouds, np.tile(np.eye(4), (3, 1, 1)), rng).covariance
+    unsure = np.diag(np.repeat([1, 4 * np.concatenate(clouds).var(0).sum()], 3))
+    np.testing.assert_allclose(found[1], unsure)
+    assert np.diagonal(found[[0, 2]], axis1=1, axis2=2).max() < 0.01
