@@ -36,6 +36,8 @@ def test_quaternions_turn_and_multiply_as_scipy_says():
     np.testing.assert_allclose(quaternion_to_matrix(multiply_quaternions(one, two)), first @ second, atol=1e-12)
     turned = rotate_by_quaternion(one, torch.tensor(vectors))
     np.testing.assert_allclose(turned, np.einsum("nij,nj->ni", first, vectors), atol=1e-12)
+    lengths = torch.linspace(0.01, 9, 20, dtype=one.dtype)[:, None]
+    np.testing.assert_allclose(normalize_quaternion(one * lengths), a, atol=1e-12)
     assert normalize_quaternion(torch.zeros(4)).tolist() == [0, 0, 0, 0]
 
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from sklearn.calibration import calibration_curve
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
@@ -34,7 +35,12 @@ def by_definition(scores: np.ndarray, labels: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_error_is_its_definition(seed):
     scores, labels = case(seed)
-    assert calibrate(scores, labels).error == pytest.approx(by_definition(scores, labels), abs=1e-12)
+    found = calibrate(scores, labels)
+    assert found.error == pytest.approx(by_definition(scores, labels), abs=1e-12)
+    shares, means = calibration_curve(scores.argmax(1) == labels, scores.max(1), n_bins=15)  # of bins that hold samples
+    assert found.accuracy[found.samples > 0] == pytest.approx(shares, abs=1e-12)
+    assert found.confidence[found.samples > 0] == pytest.approx(means, abs=1e-12)
+    assert np.isnan(found.accuracy[found.samples == 0]).all() and np.isnan(found.confidence[found.samples == 0]).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

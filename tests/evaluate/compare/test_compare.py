@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import rankdata
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
@@ -121,6 +123,33 @@ def test_bootstrap_difference_of_means_equals_scipy():
     )
     close = 4 * expected.standard_error / math.sqrt(4000) * 3  # Monte-Carlo error of a 2.5 % quantile
     assert [found.interval.low, found.interval.high] == pytest.approx(list(expected.confidence_interval), abs=close)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_single_samples_are_compared_by_all_signs_that_their_differences_could_have(seed):
+    rng = np.random.default_rng(seed)
+    a = rng.integers(0, 9, 9) / 8.0
+    b = np.where(rng.random(9) < 0.3, a, rng.integers(0, 9, 9) / 8)
+    b[0], apart = np.nan, (a - b)[1:]
+    ranks = rankdata(np.abs(apart[apart != 0]))
+    sums = np.array([np.sum(ranks[list(signs)]) for signs in itertools.product([False, True], repeat=len(ranks))])
+    farther = np.abs(sums - sums.mean()) >= abs(ranks[apart[apart != 0] > 0].sum() - sums.mean()) - 1e-9
+    for unit, key, better in (("dB", "psnr", 1), ("1", "lpips", -1)):
+        sides = [
+            metrics_of_values(n, {str(i): {key: v} for i, v in enumerate(x)}, {key: unit}) for n, x in zip("AB", (a, b))
+        ]
+        found = pair_metrics(*sides, Resampling(0))
+        own = found.changes[key]
+        assert [own.a_better, own.b_better, own.ties] == [
+            (better * apart > 0).sum(),
+            (better * apart < 0).sum(),
+            (apart == 0).sum(),
+        ]
+        assert own.wilcoxon_p == pytest.approx(farther.mean()) and own.difference == pytest.approx(
+            np.mean(a) - np.nanmean(b)
+        )
+        named = [abs(one - other) for _, one, other in found.changed]
+        assert named == sorted(np.abs(apart[apart != 0]), reverse=True)
 
 
 def test_a_table_of_values_becomes_a_whole_report(tmp_path):

@@ -165,6 +165,8 @@ def brute_matches(truth: np.ndarray, part: np.ndarray) -> int:
 def brute_miou(truth: np.ndarray, part: np.ndarray) -> float:
     truths, parts = ([set(np.flatnonzero(ids == one)) for one in np.unique(ids[ids >= 0])] for ids in (truth, part))
     parts += [set()] * len(truths)
+    if not truths:
+        return np.nan
     return max(
         np.mean([len(a & b) / len(a | b) for a, b in zip(truths, chosen, strict=True)])
         for chosen in itertools.permutations(parts, len(truths))
@@ -172,14 +174,23 @@ def brute_miou(truth: np.ndarray, part: np.ndarray) -> float:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=16))
-def test_one_frame_equals_brute_force(points):
+@given(st.lists(st.tuples(st.integers(-1, 3), st.integers(-1, 2)), min_size=1, max_size=16), st.integers(0, 4))
+def test_one_frame_equals_brute_force(points, least):
     truth, part = np.array(points).T
-    match = match_parts(truth, part, np.full((len(part), 3), 1 / 3))
-    assert match.matched.sum() == brute_matches(truth, part)
-    assert mean_iou(truth, part) == pytest.approx(brute_miou(truth, part))
+    match = match_parts(truth, part, np.full((len(part), 3), 1 / 3), ignore_below=least)
+    sizes = {one: int((truth == one).sum()) for one in set(truth.tolist()) - {-1}}
+    ground = np.array([sizes.get(one, -1) < max(least, 0) for one in truth.tolist()])
+    owners = {one: ground[part == one] for one in set(part.tolist()) - {-1}}
+    dropped = [one for one, own in owners.items() if 2 * own.sum() > len(own) or own.all()]
+    kept = np.where(ground | np.isin(part, dropped), -1, part)
+    assert match.truth_parts == sum(size >= least for size in sizes.values())
+    assert len(match.matched) == len(owners) - len(dropped)
+    assert match.matched.sum() == brute_matches(np.where(ground, -1, truth), kept)
+    truth, part = truth[~ground], part[~ground]
+    assert mean_iou(*np.array(points).T, ignore_below=least) == pytest.approx(brute_miou(truth, part), nan_ok=True)
     agree = (truth[:, None] == truth) == (part[:, None] == part)
-    assert rand_index(truth, part) == pytest.approx(agree.mean())
+    found = rand_index(*np.array(points).T, ignore_below=least)
+    assert found == pytest.approx(agree.mean() if len(truth) else np.nan, nan_ok=True)
 
 
 @settings(max_examples=40, deadline=None)

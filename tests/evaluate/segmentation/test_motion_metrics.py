@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from dpcli.cli.app import app
@@ -89,6 +91,9 @@ def test_rotation_angle(angle: float) -> None:
     first = rotation(rng)
     second = first @ rotation(rng, angle)
     assert rotation_angle(first[None], second[None])[0] == pytest.approx(angle, abs=1e-7)
+    many = Rotation.random(200, random_state=0)  # rounding takes some half turns' chords above 1
+    turned = Rotation.from_rotvec(angle * Rotation.random(200, random_state=1).apply([1.0, 0, 0])) * many
+    assert rotation_angle(many.as_matrix(), turned.as_matrix()) == pytest.approx(np.full(200, angle), abs=1e-7)
 
 
 def test_part_motions_by_hand() -> None:
@@ -108,6 +113,28 @@ def test_part_motions_by_hand() -> None:
     assert found.unmatched == 1
     unknown = part_motion_update(points, np.where(truth == 1, -1, truth), part, real, said)
     assert unknown.rotation == pytest.approx([0.2]) and unknown.unmatched == 1
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_part_motions_are_those_of_the_best_of_all_pairings(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, truth, part = rng.normal(size=(24, 3)), rng.integers(-1, 4, 24), rng.integers(0, 4, 24)
+    part = np.where(rng.random(24) < 0.4, (truth + 2) % 4, part)
+    part = np.where(part == 3, 0, part) if seed % 2 else part  # fewer predictions than parts
+    real, said = (np.array([rigid(rng) for _ in range(4)]) for _ in range(2))
+    sides = [{k: set(np.flatnonzero((ids == k) & (truth >= 0))) for k in range(4)} for ids in (truth, part)]
+    iou = np.array([[len(a & b) / max(len(a | b), 1) for b in sides[1].values()] for a in sides[0].values()])
+    pairings = sorted((iou[range(4), order].sum(), order) for order in itertools.permutations(range(4)))
+    found = part_motion_update(points, truth, part, real, said)
+    expected = []
+    for g, p in enumerate(pairings[-1][1]):
+        if iou[g, p] > 0:
+            center = np.append(points[truth == g].mean(0), 1)
+            turn = Rotation.from_matrix(real[g, :3, :3] @ said[p, :3, :3].T).magnitude()
+            expected.append((turn, np.linalg.norm(real[g] @ center - said[p] @ center)))
+    if pairings[-1][0] - pairings[-2][0] > 1e-9:  # else more than one is best
+        assert np.stack([found.rotation, found.displacement], 1) == pytest.approx(np.array(expected), abs=1e-6)
+        assert found.unmatched == sum(map(bool, sides[0].values())) - len(expected)
 
 
 def test_bad_poses_and_shapes_are_said() -> None:

@@ -10,6 +10,7 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.evaluate.video.part_discovery import (
     PART_NEIGHBORS,
+    SOLID,
     TRACK_NEIGHBORS,
     _kmeans_parts,
     carry_points,
@@ -96,6 +97,28 @@ def test_a_point_among_gaussians_without_part_has_none() -> None:
     scene.part[0] = 1
     found = surface_parts(scene, scene.frame_mean[0].astype(np.float64), 0.0)
     assert found[0] == 1 and set(found) == {-1, 1} and (found == 1).sum() <= 8 * PART_NEIGHBORS
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_point_has_the_heaviest_part_of_its_neighbors_however_many_have_none(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = toy_scene()
+    count, parts = scene.num_gaussians, scene.num_parts
+    scene = replace(
+        scene,
+        part=np.where(rng.random(count) < 0.8, -1, rng.integers(0, parts, count)).astype(np.int16),
+        opacity_logit=rng.uniform(-6, 3, count).astype(np.float32),
+    )
+    points = surface(scene, 60, seed)[0] + rng.normal(0, 0.1, (60, 3))
+    solid, means = np.flatnonzero(scene.opacity >= SOLID), scene.at(float(scene.time[0]))[0]
+    expected = []
+    for point in points:
+        apart = np.linalg.norm(means[solid] - point, axis=1)
+        near = np.argsort(apart)[:PART_NEIGHBORS]
+        weight = scene.opacity[solid[near]] / apart[near]
+        votes = [weight[scene.part[solid[near]] == part].sum() for part in range(parts)]
+        expected.append(int(np.argmax(votes)) if max(votes) > 0 else -1)
+    assert surface_parts(scene, points, float(scene.time[0])).tolist() == expected and -1 in expected
 
 
 def rigid_scene(rng: np.random.Generator, frames: int = 4) -> tuple[GaussianScene, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Resampling
-from dpcli.evaluate.video.surface import point_errors, surface_score
+from dpcli.evaluate.video.surface import SIDE, _cameras, _unproject, point_errors, surface_score, visible_points
 from dpcli.store.gaussians import GaussianScene
 from tests.support.scenes import toy_scene
 
@@ -78,3 +79,43 @@ def test_a_scene_that_shows_nothing_has_no_distance_and_no_points_are_an_error()
     assert score.unseen == 1 and np.isnan(score.chamfer).all() and (score.f_score == 0).all()
     with pytest.raises(DataError, match="no surface points"):
         surface_score(scene, np.zeros((1, 0, 3)), np.zeros(1))
+
+
+def test_the_cameras_see_all_of_a_ball_from_a_cube_s_sides_and_corners():
+    rng, middle, radius = np.random.default_rng(1), np.array([3.0, -2, 9]), 0.7
+    poses, lens = _cameras(middle, radius)
+    away = -np.einsum("cji,cj->ci", poses[:, :3, :3], poses[:, :3, 3]) - middle
+    cube = np.array([x for x in itertools.product([-1, 0, 1], repeat=3) if np.abs(x).sum() in (1, 3)])
+    cosines = (
+        away / np.linalg.norm(away, axis=1, keepdims=True) @ (cube / np.linalg.norm(cube, axis=1, keepdims=True)).T
+    )
+    np.testing.assert_allclose(np.sort(cosines.max(1)), 1, atol=1e-12)
+    assert sorted(cosines.argmax(1)) == list(range(14))
+    ball = middle + 1.4 * radius * _directions(4000)
+    for pose in poses:
+        seen = (ball @ pose[:3, :3].T + pose[:3, 3]) @ lens.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        assert (
+            (seen[:, 2] > 0).all()
+            and pixels.min(0) == pytest.approx(0, abs=0.5)
+            and pixels.max(0) == pytest.approx(SIDE, abs=0.5)
+        )
+    depth, chosen = rng.uniform(1, 9, (14, SIDE, SIDE)), rng.random((14, SIDE, SIDE)) < 1e-3
+    camera, row, column = np.nonzero(chosen)
+    back = np.einsum("nij,nj->ni", poses[camera, :3, :3], _unproject(depth, chosen, poses, lens)) + poses[camera, :3, 3]
+    np.testing.assert_allclose(back[:, 2], depth[chosen])
+    np.testing.assert_allclose((back @ lens.T / back[:, 2:])[:, :2], np.stack([column + 0.5, row + 0.5], 1))
+
+
+def test_a_scene_shows_the_same_surface_wherever_it_stands():
+    here, there = (
+        visible_points(_ball(1.0, place), 0.0, _directions(500) * [1, 1, 0.5] + [place, 0, 0]) - [place, 0, 0]
+        for place in (0.0, 8.0)
+    )
+    for points in (here, there):
+        assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.1
+        disk = (
+            14 * np.pi * (SIDE / 2 / 1.4) ** 2
+        )  # pixels of the ball in all pictures; its Gaussians' rim adds a tenth to its radius
+        assert disk < len(points) < 1.25 * disk
+    assert len(here) == pytest.approx(len(there), rel=1e-3)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpcli.generate4d.scene.seen_gaussians import trust
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
-from dpcli.ops.rigid_parts import find_parts
+from dpcli.ops.rigid_parts import _sums, find_parts
 
 FRAMES, POINTS = 12, 300
 
@@ -82,6 +83,34 @@ def test_what_no_camera_sees_has_no_say():
     found = find_parts(places, trusted, 16)
     assert len(np.unique(found)) == 2 and agree(found[: len(truth)], truth) > 0.95
     assert len(np.unique(find_parts(places, solid, 16))) > 2
+
+
+def test_points_that_are_not_trusted_go_with_the_one_that_stays_nearest():
+    places, truth = animal()
+    trusted = np.random.default_rng(1).random(len(truth)) < 0.5
+    found = find_parts(places, trusted, 16)
+    apart = np.linalg.norm(places[:, ~trusted, None] - places[:, None, trusted], axis=3)
+    nearest = found[trusted][np.square(apart).sum(0).argmin(1)]
+    assert (found[~trusted] == nearest).mean() > 0.98 and agree(found[~trusted], truth[~trusted]) > 0.9
+
+
+def test_joining_costs_what_the_best_rigid_motions_leave_of_the_union():
+    rng = np.random.default_rng(0)
+    own, weights, patch = rng.normal(size=(5, 40, 3)), rng.uniform(0.1, 1, (5, 40)), rng.integers(0, 3, 40)
+    own[1] = own[0] * [1, 1, -1]  # a mirror image, which is no motion
+    sums = _sums(own, weights, patch)
+    sets = [patch == 0, patch == 1, patch == 2, patch < 2, patch < 3]
+    unions = [*(sums.pick([k]) for k in range(3)), sums.pick([0]).plus(sums.pick([1])), sums.whole()]
+    for inside, union in zip(sets, unions):
+        left = []
+        for places, share in zip(own[:, inside], weights[:, inside]):
+            x, y = (side - np.average(side, 0, share) for side in (own[0, inside], places))
+            left.append(Rotation.align_vectors(y, x, share)[1] ** 2)
+        extent = weights[0, inside] @ np.square(own[0, inside] - np.average(own[0, inside], 0, weights[0, inside])).sum(
+            1
+        )
+        for compact in (0.0, 0.7):
+            assert union.cost(compact) == pytest.approx([np.mean(left) + compact * extent])
 
 
 def test_faint_points_have_no_say_and_all_have_where_few_are_seen():

@@ -8,8 +8,14 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
-from dpcli.segment.kinematics.part_trajectories import part_trajectories
-from dpcli.segment.kinematics.registration import Registration
+from dpcli.segment.kinematics.part_trajectories import moved, part_trajectories, points_at_start
+from dpcli.segment.kinematics.registration import (
+    Registration,
+    motion_twist,
+    register,
+    relative_registration,
+    twist_motion,
+)
 from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
@@ -160,6 +166,10 @@ def _without(sequence, gone):
     return rows, np.searchsorted(frame, np.arange(sequence.num_frames + 1))
 
 
+def _spans(sequence) -> list[slice]:
+    return [slice(a, b) for a, b in zip(sequence.frame_offsets, sequence.frame_offsets[1:])]
+
+
 def test_motions_of_many_pairs_are_averaged():
     sequence, said, *_ = cabinet()
     pairs = [(i, j) for i in range(5) for j in range(5) if i != j]
@@ -170,7 +180,22 @@ def test_motions_of_many_pairs_are_averaged():
     few = PartsSample(said.probability, np.array(pairs)[:4], motion[:4], [])  # 0 -> 1, 2, 3, 4
     many = PartsSample(said.probability, np.array(pairs), motion, [])
     apart = [np.abs(part_trajectories(sequence, one).motion - truth).mean() for one in (few, many)]
-    assert apart[1] < 0.75 * apart[0] and part_trajectories(sequence, many).disagreement.min() > 0.003
+    assert apart[1] < 0.75 * apart[0]
+    found, ids = part_trajectories(sequence, many), [sequence.part[span] for span in _spans(sequence)]
+    for k, said_apart in enumerate(found.disagreement):
+        clouds = [sequence.points[span][own == k] for span, own in zip(_spans(sequence), ids)]
+        homogeneous = [np.append(cloud, np.ones((len(cloud), 1)), 1).T for cloud in clouds]
+        start = np.concatenate([np.linalg.inv(m) @ h for m, h in zip(found.motion[:, k], homogeneous)], 1)
+        gaps = []
+        for (i, j), step in zip(pairs, motion[:, k]):
+            gaps.append((step @ found.motion[i, k] - found.motion[j, k]) @ start)
+            gaps.append((np.linalg.inv(step) @ found.motion[j, k] - found.motion[i, k]) @ start)
+        assert said_apart == pytest.approx(
+            np.sqrt(np.mean([(gap**2).sum(0) for gap in gaps])), rel=0.03
+        )  # of 64 points
+        assert 0.003 < said_apart
+        assert moved(found.motion[2, k], start[:3].T) == pytest.approx((found.motion[2, k] @ start)[:3].T)
+        assert points_at_start(sequence, k, found.motion[:, k]) == pytest.approx(start[:3].T, abs=1e-9)
 
 
 def test_a_plate_has_its_normal_and_both_edges_as_directions():
@@ -179,3 +204,52 @@ def test_a_plate_has_its_normal_and_both_edges_as_directions():
     found = directions_and_edges(plate)
     assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
     assert len(distinct_directions(found)) == 3
+
+
+def test_the_errors_of_two_motions_make_those_of_the_motion_between_them():
+    from scipy.spatial.transform import Rotation
+
+    rng, draws = np.random.default_rng(2), 4000
+    known, erring = [], []
+    for _ in range(2):
+        motion = np.tile(np.eye(4), (3, 1, 1))
+        motion[:, :3, :3] = Rotation.random(3, random_state=rng.integers(99)).as_matrix()
+        motion[:, :3, 3] = rng.normal(size=(3, 3))
+        root = 1e-3 * rng.normal(size=(3, 6, 6))
+        known.append(Registration(motion, rng.normal(size=3), 1.0, root @ root.transpose(0, 2, 1)))
+        twist = np.einsum("tij,ntj->nti", root, rng.normal(size=(draws, 3, 6)))
+        turn, center = Rotation.from_rotvec(twist[..., :3].reshape(-1, 3)).as_matrix(), known[-1].center
+        moved = np.tile(np.eye(4), (draws, 3, 1, 1))
+        moved[..., :3, :3] = turn.reshape(draws, 3, 3, 3)
+        moved[..., :3, 3] = center + twist[..., 3:] - moved[..., :3, :3] @ center
+        np.testing.assert_allclose(twist_motion(twist, center), moved, atol=1e-12)
+        np.testing.assert_allclose(motion_twist(moved, center), twist, atol=1e-12)
+        erring.append(motion @ moved)
+    found = relative_registration(*known)
+    np.testing.assert_allclose(known[0].motion @ found.motion, known[1].motion, atol=1e-12)
+    error = motion_twist(np.linalg.inv(found.motion) @ np.linalg.inv(erring[0]) @ erring[1], known[1].center)
+    drawn = np.einsum("nti,ntj->tij", error, error) / draws
+    scale = np.sqrt(np.einsum("tii->ti", found.covariance))
+    np.testing.assert_allclose((drawn - found.covariance) / scale[:, None] / scale[..., None], 0, atol=0.1)
+
+
+def test_how_surely_motions_are_known_is_the_same_in_any_place_pose_and_unit():
+    rng, turns = np.random.default_rng(3), [about((0, 0.6, 0.8), 0.5 * t, (1, 2, 3)) for t in range(3)]
+    clouds = [_surface(rng, 200, np.ones(3)) + rng.normal([9, -7, 5], 0.01, (200, 3)) for _ in turns]
+    still = register(clouds, np.tile(np.eye(4), (3, 1, 1)), np.random.default_rng(0))
+    for unit in (1.0, 50.0):
+        motion = np.array(turns)
+        motion[:, :3, 3] *= unit
+        carried = [unit * cloud @ m[:3, :3].T + m[:3, 3] for cloud, m in zip(clouds, motion)]
+        found = register(carried, motion, np.random.default_rng(0))
+        lengths = np.repeat([1, unit], 3)
+        np.testing.assert_allclose(
+            found.covariance, still.covariance * lengths[:, None] * lengths, rtol=1e-2, atol=1e-9
+        )
+        assert found.size == pytest.approx(unit * np.linalg.norm(np.std(np.concatenate(clouds), 0)))
+        np.testing.assert_allclose(found.center, unit * np.concatenate(clouds).mean(0), atol=1e-6 * unit)
+    clouds[1] = clouds[1][:3]  # which say nothing
+    found = register(clouds, np.tile(np.eye(4), (3, 1, 1)), rng).covariance
+    unsure = np.diag(np.repeat([1, 4 * np.concatenate(clouds).var(0).sum()], 3))
+    np.testing.assert_allclose(found[1], unsure)
+    assert np.diagonal(found[[0, 2]], axis1=1, axis2=2).max() < 0.01
