@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -19,6 +18,7 @@ from dpcli.prepare.array_files.choosing import says_times
 from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, ArchivedDepth, archived_depth, depth_frames, says_depth
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
+from dpcli.prepare.decode import tiff
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
@@ -45,8 +45,8 @@ _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
+_MAP = re.compile(rb"P5" + 3 * rb"(?:\s|#[^\r\n]*[\r\n])+(\d+)" + rb"\s")  # the header of a PGM in bytes, with comments
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: of more than 4 GB
-_PHOTOMETRIC, _ORIENTATION = 262, 274  # tags of TIFF: which color 0 is; how the picture is turned where it is shown
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
@@ -244,13 +244,11 @@ def read_image(path: Path) -> np.ndarray:
     check_picture(data, path)
     if (image := _portable_map(data, path)) is not None:
         return image
+    spread = tiff.require_unchanged(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages and data.startswith(_TIFF):
-        raise DataError(
-            f"{path}: a TIFF that is damaged, or whose compression or type of number isn't read; save it uncompressed or with LZW"
-            " or deflate, in whole numbers of 16 or 32 bits or float32"
-        )
+        raise DataError(f"{path}: {tiff.UNREAD}")
     if not pages:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
     if len(pages) > 1:  # which of them is the frame?
@@ -265,32 +263,20 @@ def read_image(path: Path) -> np.ndarray:
         image = image[..., 0]
     if image.dtype == np.uint8 and has_white_at_zero(data):
         return 255 - image  # which OpenCV turned round, of 8 bits alone
-    return image
+    return image >> spread if spread else image
 
 
 def has_white_at_zero(data: bytes) -> bool:
     """Returns whether the bytes are those of a TIFF that says its 0 is white, which has no defined meaning for depth."""
-    return _tiff_tag(data, _PHOTOMETRIC) == 0
-
-
-def _tiff_tag(data: bytes, tag: int) -> int | None:
-    """Returns a number that a TIFF tells about itself; None where it doesn't, and of other files."""
-    if not data.startswith((b"II", b"MM")):
-        return None
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            return getattr(image, "tag_v2", {}).get(tag)
-    except (OSError, ValueError, SyntaxError, TypeError):  # a kind of TIFF that Pillow doesn't know
-        return None
+    return tiff.read_tags(data).get(tiff.PHOTOMETRIC, (1,))[0] == 0
 
 
 def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
     """Returns the gray levels of a PGM in text as they are written, u8 or u16 (H,W): OpenCV spreads those below 256 over all
-    bytes. None of other files, unless they are what OpenCV changes unasked: PFM with a scale, PNG of fewer than 8 bits.
+    bytes. None of other files.
 
-    Raises DataError of these two, and of texts that end early.
+    Raises DataError of what OpenCV changes unasked or leaves out: PFM with a scale, PNG and PBM of fewer than 8 bits, all but the
+    first of several PGM in one file; and of texts that end early.
     """
     if data.startswith((b"Pf", b"PF")):
         words = data[:200].split(None, 4)[:4]
@@ -299,6 +285,15 @@ def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
                 f"{path}: its header gives the scale {words[3].decode('latin-1')}, by which some readers divide and others"
                 " don't; save it with the scale 1 or -1"
             )
+    elif header := _MAP.match(data):
+        width, height, most = map(int, header.groups())
+        rest = data[header.end() + width * height * (1 + (most > 255)) :].lstrip()
+        if re.match(rb"P[1-7]\s", rest):
+            raise DataError(
+                f"{path}: holds several pictures, one behind another; expected one: pamsplit makes a file of each"
+            )
+    elif data.startswith((b"P1", b"P4")):
+        raise DataError(f"{path}: 1 bit a pixel, too few for depth; expected 8 or 16")
     elif (header := read_header(data)) and header.bits < 8 and header.color == 0:
         raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
     if not data.startswith(b"P2"):
@@ -456,9 +451,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
             raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
         times = series.times()
         first = series.paths[0]
-        tiff = first.read_bytes() if first.suffix.lower() in (".tif", ".tiff") else b""
-        turned = _tiff_tag(tiff, _ORIENTATION) not in (None, 1)  # which OpenCV does
-        known = {WHITE_AT_ZERO: int(has_white_at_zero(tiff)), TURNED: int(turned)}
+        data = first.read_bytes() if first.suffix.lower() in (".tif", ".tiff") else b""
+        turned = tiff.read_tags(data).get(tiff.ORIENTATION, (1,))[0] != 1  # which OpenCV does
+        known = {WHITE_AT_ZERO: int(has_white_at_zero(data)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
         told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
