@@ -236,7 +236,9 @@ def read_image(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         from dpcli.prepare.decode.exr import read_exr
 
-        return read_exr(path)
+        frame, channel = read_exr(path)
+        require_depth(path, channel)
+        return frame
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:

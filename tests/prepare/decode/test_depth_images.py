@@ -239,3 +239,39 @@ def test_what_stands_in_for_a_file_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
     with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
         read_depth_video(tmp_path if name.endswith(("png", "tif")) else tmp_path / name)
+
+
+@pytest.mark.parametrize("corner", [(10, 5), (-3, -2), (90, -4), (0, 0)])
+def test_the_frame_of_an_openexr_is_its_display_window(tmp_path, corner):
+    openexr = pytest.importorskip("OpenEXR")
+    pixels = np.random.default_rng(0).uniform(1, 2, (6, 20)).astype(np.float32)
+    (x, y), (height, width) = corner, (9, 100)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    windows = {"dataWindow": (x, y, x + 19, y + 5), "displayWindow": (0, 0, width - 1, height - 1)}
+    header |= {name: tuple(np.array(own, np.int32).reshape(2, 2)) for name, own in windows.items()}
+    openexr.File(header, {"Z": pixels}).write(str(tmp_path / "a.exr"))
+    wide = np.zeros((height + 20, width + 40), np.float32)  # the picture and 10 rows, 20 columns around it
+    wide[y + 10 : y + 16, x + 20 : x + 40] = pixels
+    np.testing.assert_array_equal(read_frame(tmp_path / "a.exr"), wide[10:-10, 20:-20])
+
+
+def test_the_z_of_a_normal_is_no_depth_and_disparities_are_refused(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    path, frame = tmp_path / "a.exr", np.random.default_rng(0).uniform(1, 2, (6, 8)).astype(np.float32)
+    normal = {f"Normal.{axis}": np.full_like(frame, value) for axis, value in zip("XYZ", (0.6, 0.0, 0.8))}
+    openexr.File(dict(header), normal).write(str(path))
+    with pytest.raises(DataError, match=r"holds channels Normal\.X, Normal\.Y, Normal\.Z; expected one called Z"):
+        read_frame(path)
+    openexr.File(dict(header), {**normal, "Layer.Depth.Z": frame}).write(str(path))
+    np.testing.assert_array_equal(read_frame(path), frame)
+    openexr.File(dict(header), {"disparity": frame}).write(str(path))
+    with pytest.raises(DataError, match="by its name it holds disparities"):
+        read_frame(path)
+    deep = np.empty(frame.shape, object)
+    for place in np.ndindex(frame.shape):
+        deep[place] = np.full(2, 1.5, np.float32)
+    header |= {"compression": openexr.ZIPS_COMPRESSION, "type": openexr.deepscanline}
+    openexr.File(header, {"Z": deep, "A": deep}).write(str(path))
+    with pytest.raises(DataError, match="holds deep pixels"):
+        read_frame(path)
