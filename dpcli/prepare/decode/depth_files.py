@@ -18,9 +18,10 @@ from dpcli.prepare.array_files.choosing import says_times
 from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, ArchivedDepth, archived_depth, depth_frames, says_depth
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
-from dpcli.prepare.decode import tiff
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
+from dpcli.prepare.decode.pictures import tiff
+from dpcli.prepare.decode.pictures.portable_maps import read_portable_map
+from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header, significant_bits
 from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.other_files import stand_in
@@ -38,6 +39,9 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
+_ALONG_RAY = re.compile(r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid", re.IGNORECASE)
+_RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
+_BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY_NOISE, _COLORED_SHARE = 24, 0.02
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
@@ -45,8 +49,11 @@ _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
-_MAP = re.compile(rb"P5" + 3 * rb"(?:\s|#[^\r\n]*[\r\n])+(\d+)" + rb"\s")  # the header of a PGM in bytes, with comments
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: of more than 4 GB
+SPREAD = (
+    "videos of PNGs that say {} of 16 bits are significant (sBIT), as where numbers were multiplied to fill them; taken as stored"
+    " (--depth-scale)"
+)
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
@@ -234,7 +241,7 @@ def _colored(frame: np.ndarray) -> bool:
 def read_image(path: Path) -> np.ndarray:
     """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
     if path.suffix.lower() == ".exr":
-        from dpcli.prepare.decode.exr import read_exr
+        from dpcli.prepare.decode.pictures.exr import read_exr
 
         frame, channel = read_exr(path)
         require_depth(path, channel)
@@ -244,8 +251,10 @@ def read_image(path: Path) -> np.ndarray:
     if image is not None:
         return image
     check_picture(data, path)
-    if (image := _portable_map(data, path)) is not None:
+    if (image := read_portable_map(data, path)) is not None:
         return image
+    if (header := read_header(data)) and header.bits < 8 and header.color == 0:
+        raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
     spread = tiff.require_unchanged(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
@@ -271,45 +280,6 @@ def read_image(path: Path) -> np.ndarray:
 def has_white_at_zero(data: bytes) -> bool:
     """Returns whether the bytes are those of a TIFF that says its 0 is white, which has no defined meaning for depth."""
     return tiff.read_tags(data).get(tiff.PHOTOMETRIC, (1,))[0] == 0
-
-
-def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
-    """Returns the gray levels of a PGM in text as they are written, u8 or u16 (H,W): OpenCV spreads those below 256 over all
-    bytes. None of other files.
-
-    Raises DataError of what OpenCV changes unasked or leaves out: PFM with a scale, PNG and PBM of fewer than 8 bits, all but the
-    first of several PGM in one file; and of texts that end early.
-    """
-    if data.startswith((b"Pf", b"PF")):
-        words = data[:200].split(None, 4)[:4]
-        if len(words) == 4 and not re.fullmatch(rb"[-+]?1(\.0*)?", words[3]):
-            raise DataError(
-                f"{path}: its header gives the scale {words[3].decode('latin-1')}, by which some readers divide and others"
-                " don't; save it with the scale 1 or -1"
-            )
-    elif header := _MAP.match(data):
-        width, height, most = map(int, header.groups())
-        rest = data[header.end() + width * height * (1 + (most > 255)) :].lstrip()
-        if re.match(rb"P[1-7]\s", rest):
-            raise DataError(
-                f"{path}: holds several pictures, one behind another; expected one: pamsplit makes a file of each"
-            )
-    elif data.startswith((b"P1", b"P4")):
-        raise DataError(f"{path}: 1 bit a pixel, too few for depth; expected 8 or 16")
-    elif (header := read_header(data)) and header.bits < 8 and header.color == 0:
-        raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
-    if not data.startswith(b"P2"):
-        return None
-    try:
-        width, height, most, *levels = map(int, re.sub(rb"#[^\r\n]*", b"", data[2:]).split())
-    except ValueError:
-        raise DataError(f"{path}: not a readable PGM; expected whole numbers") from None
-    if len(levels) != width * height or not 0 < most < 65536 or max(levels, default=0) > most:
-        raise DataError(
-            f"{path}: {len(levels)} levels of {width}x{height} pixels, up to {max(levels, default=0)} of {most}: truncated or"
-            " damaged"
-        )
-    return np.array(levels, np.uint8 if most < 256 else np.uint16).reshape(height, width)
 
 
 def read_frame(path: Path) -> np.ndarray:
@@ -378,6 +348,21 @@ def require_depth(path: Path, name: str) -> None:
         )
 
 
+def doubts_of_name(name: str) -> dict[str, int]:
+    """Returns a note where a video's name says distances from the camera's center, or what a network makes of one picture."""
+    if said := _ALONG_RAY.search(name):
+        return {
+            f"videos that by their names hold distances from the camera ({said[0]}), taken for depth along its axis; if they are"
+            " lengths of the rays, as Hypersim's are, flat walls come out bent: divide each by that of its pixel's ray": 1
+        }
+    if said := _RELATIVE.search(name):
+        return {
+            f"videos that by their names are what a network guessed from one picture ({said[0]}): as a rule neither meters nor, as"
+            " MiDaS's, depth but its inverse; taken for depth": 1
+        }
+    return {}
+
+
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame, (H,W) or (H,W,1), by its header where it has one."""
     try:
@@ -388,7 +373,9 @@ def _is_frame(path: Path) -> bool:
 
 
 def _holds_depth(path: Path) -> bool:
-    """Returns whether a file can be a frame of depth: gray of more than 8 bits."""
+    """Returns whether a file can be a frame of depth: gray of more than 8 bits, by its name not of an infrared camera."""
+    if not says_depth(path.stem) and (_INFRARED.search(path.stem) or _BRIGHTNESS.search(path.stem)):
+        return False
     try:
         return read_frame(path).dtype != np.uint8
     except DataError:
@@ -459,6 +446,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
         told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
+        bits = significant_bits(first) if first.suffix.lower() == ".png" and video.frames.dtype == np.uint16 else 16
+        if bits < 16 and video.frames.max(initial=0) >= 1 << bits:
+            video.notes[SPREAD.format(bits)] = 1
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         try:
             video = _read_file(path, stride)

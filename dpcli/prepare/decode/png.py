@@ -53,6 +53,16 @@ def png_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
+def significant_bits(path: Path) -> int:
+    """Returns how many of its bits a gray PNG says are significant; all of them where it doesn't, 16 where it is no PNG."""
+    with open(path, "rb") as file:
+        data = file.read(_HEADER.size + 4096)
+    header, place = read_header(data), data.find(b"\0\0\0\1sBIT", 0, data.find(b"IDAT"))
+    if header is None or header.color != 0:
+        return 16
+    return min(data[place + 8], header.bits) if place > 0 else header.bits
+
+
 @cache
 def _decoders() -> dict[int, Callable]:
     """Returns bits -> function of (bytes, (height, width), mode); none where kornia-rs is missing or of another kind."""

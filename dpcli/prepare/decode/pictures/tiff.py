@@ -1,4 +1,4 @@
-"""What a TIFF tells about its numbers, of which OpenCV, which decodes it, changes some unasked or leaves some out."""
+"""Reads what a TIFF tells about its numbers, of which OpenCV, which decodes it, changes some unasked or leaves some out."""
 
 from __future__ import annotations
 
