@@ -23,7 +23,7 @@ from dpcli.prepare.decode.pictures import tiff
 from dpcli.prepare.decode.pictures.portable_maps import read_portable_map
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header, significant_bits
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early, joined_videos, promised_frames
 from dpcli.runtime.clips.other_files import stand_in
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ _RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|ne
 _BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY_NOISE, _COLORED_SHARE = 24, 0.02
+_QUICKTIME = (".mov", ".mp4", ".m4v")
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
 WHITE_AT_ZERO = (
@@ -56,6 +57,7 @@ SPREAD = (
 )
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
+JOINED = "videos behind the first in one file, whose frames may not be read; join them by ffmpeg -f concat instead"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
 
@@ -129,6 +131,11 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
         # in others depth often lies beside color; asking takes a tenth of a second
         one_stream = path.suffix.lower() == ".avi"
         stream = None if one_stream and tag in (_GRAY16, *_EIGHT_BITS) else depth_stream(path)
+        if stream and (stream.codec, stream.pixel_format) == ("rawvideo", "gray") and path.suffix.lower() in _QUICKTIME:
+            raise DataError(
+                f"{path}: raw gray of 8 bits in QuickTime, of which some programs write 0 for white and others 0 for black, and"
+                " nothing tells which; write it again from its source: -c:v ffv1"
+            )
         if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []
             frames = list(_decoded(capture, path, 0, None, stride, stamps))
@@ -478,6 +485,10 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
     frames, time, missing = read_timed_video(path, stride)
     if not frames:
         raise DataError(f"{path}: an empty video: no frame can be decoded")
-    told = {LEFT_OUT: empty_frames(path, 0), TURNED: int(how_shown(path)[1] > 0)}
+    told = {
+        LEFT_OUT: empty_frames(path, 0),
+        TURNED: int(how_shown(path)[1] > 0),
+        JOINED: max(joined_videos(path) - 1, 0),
+    }
     notes = {what: count for what, count in told.items() if count}
     return DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)

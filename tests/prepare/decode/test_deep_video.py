@@ -234,3 +234,12 @@ def test_frames_that_are_interlaced_behind_others_are_refused(tmp_path):
     assert how_shown(tmp_path / "a.mkv") == (False, 0) and how_shown(tmp_path / "a.mkv", every=True) == (True, 0)
     with pytest.raises(DataError, match="interlaced"):
         read_depth_video(tmp_path / "a.mkv")
+
+
+def test_raw_gray_of_quicktime_whose_white_is_unknown_is_refused(tmp_path):
+    """Of ffmpeg's own files ffmpeg gives 255 less the numbers that were written."""
+    frames = np.arange(48 * 64, dtype=np.uint8).reshape(1, 48, 64)
+    with pytest.raises(DataError, match="raw gray of 8 bits in QuickTime"):
+        read_depth_video(encode(tmp_path / "a.mov", frames, "gray", "rawvideo"))
+    for name, codec in (("a.mkv", "rawvideo"), ("b.mov", "ffv1")):
+        np.testing.assert_array_equal(read_depth_video(encode(tmp_path / name, frames, "gray", codec)).frames, frames)
