@@ -24,6 +24,7 @@ from dpcli.prepare.decode.pictures.portable_maps import read_portable_map
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header, significant_bits
 from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, joined_videos, promised_frames
+from dpcli.runtime.clips.cropping import margins
 from dpcli.runtime.clips.other_files import stand_in
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ SPREAD = (
     "videos of PNGs that say {} of 16 bits are significant (sBIT), as where numbers were multiplied to fill them; taken as stored"
     " (--depth-scale)"
 )
+_MARGINS = "says that margins of its frames are cut off; write it again without them: ffmpeg -i IN -c:v ffv1 depth.mkv"
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
 JOINED = "videos behind the first in one file, whose frames may not be read; join them by ffmpeg -f concat instead"
@@ -148,6 +150,8 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
             f"{path}: its depth is stream {stream.place} ({stream.described()}) of several; copy it to a file of its own:"
             f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
         )
+    if any(margins(path, stream.place, (stream.width, stream.height))):
+        raise DataError(f"{path}: {_MARGINS}")
     turned = how_shown(path, stream.place)[1]
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
     times = rising_times([seconds for _, seconds in kept], rate, stride)
@@ -228,8 +232,10 @@ def _decoded(
 
 def _require_progressive(path: Path, *, every: bool) -> None:
     """Raises DataError for interlaced frames, which some versions of OpenCV replace by the frame before, or by anything."""
-    from dpcli.prepare.decode.video_streams import how_shown
+    from dpcli.prepare.decode.video_streams import cuts_left, how_shown
 
+    if not every and cuts_left(path):
+        raise DataError(f"{path}: {_MARGINS}")
     if how_shown(path, every=every)[0]:
         raise DataError(
             f"{path}: interlaced: each frame may show two moments, line by line, between which depth is none; if each shows one,"
