@@ -358,9 +358,21 @@ def choose_series(
     if len(found) > 1:
         raise DataError(
             f"{folder}: holds {len(found)} series of frames: {', '.join(one.described() for one in found[:6])}; name one:"
-            f" --pattern '{found[0].pattern}', or put each into a folder of its own"
+            f" --pattern '{_pattern_of_one(found)}', or put each into a folder of its own"
         )
     return replace(found[0], left_out=(*(one.described() for one in left_out), *sorted(beside)))
+
+
+def _pattern_of_one(found: list[Series]) -> str:
+    """Returns a pattern that only one of several series fits; where none is found, that of the first."""
+    for one in found:
+        others = [name for other in found if other is not one for name in other.names]
+        for pattern in (one.pattern, f"*[0-9]{one.suffix}"):
+            if not any(fnmatchcase(name, pattern) for name in others) and all(
+                fnmatchcase(name, pattern) for name in one.names
+            ):
+                return pattern
+    return found[0].pattern
 
 
 def _by_pattern(folder: Path, names: list[str], pattern: str) -> Series | None:

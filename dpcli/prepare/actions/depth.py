@@ -30,12 +30,13 @@ from dpcli.prepare.decode.depth_files import (
     ARRAY_SUFFIXES,
     VIDEO_SUFFIXES,
     DepthVideo,
+    doubts_of_name,
     frame_series,
     read_depth_video,
     require_depth,
     tells_times,
 )
-from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
+from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -54,14 +55,14 @@ DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of 
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
     r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|disparit|semantic|instance|segm|albedo|flow|image|photo"
-    r"|infra|thermal|reflect|ambient|uncertain|varianc|fisheye|skelet|inerti|temperature|active_?brightness"
+    r"|(?<![a-z])seg(?![a-z])|infra|thermal|reflect|ambient|uncertain|varianc|fisheye|skelet|inerti|temperature|active_?brightness"
     r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
 _CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz")  # points, not pictures
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
-    " .svo2 .r3d .sens .xef .klg .dat .pkl .vrs .rrd .nc .zarr".split()
+    " .svo2 .r3d .sens .xef .klg .dpt .depth .dat .pkl .vrs .rrd .nc .zarr".split()
 )
 _HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
@@ -190,13 +191,14 @@ class DepthVideos:
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         series: Series | None = item.extra["series"]
-        require_depth(item.path, f"{item.name} {series.pattern if series else ''}")
+        name = f"{item.name} {series.pattern if series else ''}"
+        require_depth(item.path, name)
         video = self._video(item)
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
-        notes |= video.notes | ({} if told else doubts_of_units(depth))
+        notes |= doubts_of_name(name) | video.notes | ({} if told else doubts_of_units(depth))
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
@@ -302,6 +304,8 @@ class DepthVideos:
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
                 " where a file tells none"
             )
+            if cameras := [one for given in self.inputs for one in calibrations_below(given)]:
+                lines.append(f"{first_names(cameras, 3)}: not read; if the camera is in there, give --intrinsics FILE")
         if self.calibration:
             lines += self.calibration.notes()
         if _FARTHEST < self.far < np.inf:

@@ -25,6 +25,10 @@ _WIDE, _SPARSE = (
 LIKE_KITTI = (
     "videos of wide pictures with few depths; if they are KITTI's, 256 units are a meter: give --depth-scale 256"
 )
+UP_TO_ONE = (
+    "videos of depths that end at exactly 1, as a depth buffer's or those divided by the largest do; taken for meters"
+    " (--depth-scale, --far)"
+)
 _ROWS = 16  # of a frame that are looked at
 
 
@@ -88,11 +92,14 @@ def _roughness(rows: np.ndarray) -> float:
 def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
     in millimeters; the low bits of 8 may hold flags. Or when they are wide pictures with few depths, as KITTI has them of its
-    lidar.
+    lidar; or floats of which many are 1 and none more, as where a range was divided by its end.
     """
-    if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
-        return {}
     middle = frames[len(frames) // 2]
+    if frames.dtype.kind == "f":
+        several = np.count_nonzero(middle == 1) > _MARKED * middle.size
+        return {UP_TO_ONE: 1} if several and frames.max() == 1 and ((middle > 0) & (middle < 1)).any() else {}
+    if frames.dtype.itemsize != 2:
+        return {}
     if middle.shape[1] >= _WIDE * middle.shape[0] and np.count_nonzero(middle) < _SPARSE * middle.size:
         return {LIKE_KITTI: 1}
     some = _some_depths(frames)

@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
+from dpcli.prepare.decode.pictures.tiff import BITS, COMPRESSION
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import Series, about_series, choose_series
 from dpcli.prepare.times_beside import with_times
@@ -213,6 +214,7 @@ def read_rgba(path: Path) -> np.ndarray:
     """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
     with _readable(path) as image:
         require_one_picture(path, image)
+        _require_known_numbers(path, image)
         return _to_rgba(as_shown(image), path)
 
 
@@ -233,10 +235,29 @@ def _readable(path: Path):  # -> Iterator[PIL.Image.Image]
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None
 
 
+def _require_known_numbers(path: Path, image) -> None:  # image: PIL.Image.Image
+    """Raises DataError of gray whose numbers Pillow gives changed: TIFFs of 9 to 15 bits, and those of other than unsigned 16
+    that are compressed with the high byte first.
+    """
+    tags = getattr(image, "tag_v2", None)
+    if tags is None:
+        return
+    if 8 < (bits := tags.get(BITS, (8,))[0]) < 16:
+        raise DataError(f"{path}: a TIFF of {bits} bits a channel; expected 8 or 16: export this frame again")
+    if image.mode in ("F", "I") and tags.prefix == b"MM" and tags.get(COMPRESSION, 1) != 1:
+        raise DataError(f"{path}: compressed numbers of {bits} bits, high byte first; expected 8 or unsigned 16 bits")
+
+
 def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
+    from PIL import Image
+
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
         top = gray.max(initial=0)
+        if image.mode != "F" and not 0 <= gray.min(initial=0) <= top < 1 << 16:
+            raise DataError(
+                f"{path}: gray from {gray.min():.0f} to {top:.0f}; expected 0 to 255 or to 65535: export this frame again"
+            )
         unit = 1 / 255 if image.mode == "F" and top < 2 else 257.0 if top > 255 else 1.0
         if unit == 1 and top and image.mode != "F":
             with log.each_once(_SAID):
@@ -247,7 +268,9 @@ def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
         level = image.info.get("transparency")  # of PNG: what is see-through
         clear = (gray == level) & isinstance(level, int)
         gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
-        return np.dstack([gray, gray, gray, np.where(clear, 0, 255).astype(np.uint8)])
+        rgb = Image.fromarray(np.dstack([gray, gray, gray]))  # to which as_shown applies what the file says of its gray
+        shown = as_shown(rgb, {name: image.info[name] for name in ("gamma", "srgb") if name in image.info})
+        return np.dstack([np.array(shown)[..., :3], np.where(clear, 0, 255).astype(np.uint8)])
     return np.array(image.convert("RGBA"))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -20,9 +19,12 @@ from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, ArchivedDepth, archived_depth, depth_frames, says_depth
 from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
+from dpcli.prepare.decode.pictures import tiff
+from dpcli.prepare.decode.pictures.portable_maps import read_portable_map
+from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header, significant_bits
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early, joined_videos, promised_frames
+from dpcli.runtime.clips.cropping import margins
 from dpcli.runtime.clips.other_files import stand_in
 
 if TYPE_CHECKING:
@@ -38,17 +40,26 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
+_ALONG_RAY = re.compile(r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid", re.IGNORECASE)
+_RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
+_BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY_NOISE, _COLORED_SHARE = 24, 0.02
+_QUICKTIME = (".mov", ".mp4", ".m4v")
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
 WHITE_AT_ZERO = (
     "videos of TIFFs that say their 0 is white; their numbers are taken as stored (--invert if larger ones are nearer)"
 )
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: of more than 4 GB
-_PHOTOMETRIC, _ORIENTATION = 262, 274  # tags of TIFF: which color 0 is; how the picture is turned where it is shown
+SPREAD = (
+    "videos of PNGs that say {} of 16 bits are significant (sBIT), as where numbers were multiplied to fill them; taken as stored"
+    " (--depth-scale)"
+)
+_MARGINS = "says that margins of its frames are cut off; write it again without them: ffmpeg -i IN -c:v ffv1 depth.mkv"
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
+JOINED = "videos behind the first in one file, whose frames may not be read; join them by ffmpeg -f concat instead"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
 
@@ -122,6 +133,11 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
         # in others depth often lies beside color; asking takes a tenth of a second
         one_stream = path.suffix.lower() == ".avi"
         stream = None if one_stream and tag in (_GRAY16, *_EIGHT_BITS) else depth_stream(path)
+        if stream and (stream.codec, stream.pixel_format) == ("rawvideo", "gray") and path.suffix.lower() in _QUICKTIME:
+            raise DataError(
+                f"{path}: raw gray of 8 bits in QuickTime, of which some programs write 0 for white and others 0 for black, and"
+                " nothing tells which; write it again from its source: -c:v ffv1"
+            )
         if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []
             frames = list(_decoded(capture, path, 0, None, stride, stamps))
@@ -134,6 +150,8 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
             f"{path}: its depth is stream {stream.place} ({stream.described()}) of several; copy it to a file of its own:"
             f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
         )
+    if any(margins(path, stream.place, (stream.width, stream.height))):
+        raise DataError(f"{path}: {_MARGINS}")
     turned = how_shown(path, stream.place)[1]
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
     times = rising_times([seconds for _, seconds in kept], rate, stride)
@@ -214,8 +232,10 @@ def _decoded(
 
 def _require_progressive(path: Path, *, every: bool) -> None:
     """Raises DataError for interlaced frames, which some versions of OpenCV replace by the frame before, or by anything."""
-    from dpcli.prepare.decode.video_streams import how_shown
+    from dpcli.prepare.decode.video_streams import cuts_left, how_shown
 
+    if not every and cuts_left(path):
+        raise DataError(f"{path}: {_MARGINS}")
     if how_shown(path, every=every)[0]:
         raise DataError(
             f"{path}: interlaced: each frame may show two moments, line by line, between which depth is none; if each shows one,"
@@ -234,23 +254,25 @@ def _colored(frame: np.ndarray) -> bool:
 def read_image(path: Path) -> np.ndarray:
     """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
     if path.suffix.lower() == ".exr":
-        from dpcli.prepare.decode.exr import read_exr
+        from dpcli.prepare.decode.pictures.exr import read_exr
 
-        return read_exr(path)
+        frame, channel = read_exr(path)
+        require_depth(path, channel)
+        return frame
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:
         return image
     check_picture(data, path)
-    if (image := _portable_map(data, path)) is not None:
+    if (image := read_portable_map(data, path)) is not None:
         return image
+    if (header := read_header(data)) and header.bits < 8 and header.color == 0:
+        raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
+    spread = tiff.require_unchanged(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages and data.startswith(_TIFF):
-        raise DataError(
-            f"{path}: a TIFF that is damaged, or whose compression or type of number isn't read; save it uncompressed or with LZW"
-            " or deflate, in whole numbers of 16 or 32 bits or float32"
-        )
+        raise DataError(f"{path}: {tiff.UNREAD}")
     if not pages:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
     if len(pages) > 1:  # which of them is the frame?
@@ -265,54 +287,12 @@ def read_image(path: Path) -> np.ndarray:
         image = image[..., 0]
     if image.dtype == np.uint8 and has_white_at_zero(data):
         return 255 - image  # which OpenCV turned round, of 8 bits alone
-    return image
+    return image >> spread if spread else image
 
 
 def has_white_at_zero(data: bytes) -> bool:
     """Returns whether the bytes are those of a TIFF that says its 0 is white, which has no defined meaning for depth."""
-    return _tiff_tag(data, _PHOTOMETRIC) == 0
-
-
-def _tiff_tag(data: bytes, tag: int) -> int | None:
-    """Returns a number that a TIFF tells about itself; None where it doesn't, and of other files."""
-    if not data.startswith((b"II", b"MM")):
-        return None
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            return getattr(image, "tag_v2", {}).get(tag)
-    except (OSError, ValueError, SyntaxError, TypeError):  # a kind of TIFF that Pillow doesn't know
-        return None
-
-
-def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
-    """Returns the gray levels of a PGM in text as they are written, u8 or u16 (H,W): OpenCV spreads those below 256 over all
-    bytes. None of other files, unless they are what OpenCV changes unasked: PFM with a scale, PNG of fewer than 8 bits.
-
-    Raises DataError of these two, and of texts that end early.
-    """
-    if data.startswith((b"Pf", b"PF")):
-        words = data[:200].split(None, 4)[:4]
-        if len(words) == 4 and not re.fullmatch(rb"[-+]?1(\.0*)?", words[3]):
-            raise DataError(
-                f"{path}: its header gives the scale {words[3].decode('latin-1')}, by which some readers divide and others"
-                " don't; save it with the scale 1 or -1"
-            )
-    elif (header := read_header(data)) and header.bits < 8 and header.color == 0:
-        raise DataError(f"{path}: {header.bits} bits a pixel, too few for depth; expected 8 or 16")
-    if not data.startswith(b"P2"):
-        return None
-    try:
-        width, height, most, *levels = map(int, re.sub(rb"#[^\r\n]*", b"", data[2:]).split())
-    except ValueError:
-        raise DataError(f"{path}: not a readable PGM; expected whole numbers") from None
-    if len(levels) != width * height or not 0 < most < 65536 or max(levels, default=0) > most:
-        raise DataError(
-            f"{path}: {len(levels)} levels of {width}x{height} pixels, up to {max(levels, default=0)} of {most}: truncated or"
-            " damaged"
-        )
-    return np.array(levels, np.uint8 if most < 256 else np.uint16).reshape(height, width)
+    return tiff.read_tags(data).get(tiff.PHOTOMETRIC, (1,))[0] == 0
 
 
 def read_frame(path: Path) -> np.ndarray:
@@ -381,6 +361,21 @@ def require_depth(path: Path, name: str) -> None:
         )
 
 
+def doubts_of_name(name: str) -> dict[str, int]:
+    """Returns a note where a video's name says distances from the camera's center, or what a network makes of one picture."""
+    if said := _ALONG_RAY.search(name):
+        return {
+            f"videos that by their names hold distances from the camera ({said[0]}), taken for depth along its axis; if they are"
+            " lengths of the rays, as Hypersim's are, flat walls come out bent: divide each by that of its pixel's ray": 1
+        }
+    if said := _RELATIVE.search(name):
+        return {
+            f"videos that by their names are what a network guessed from one picture ({said[0]}): as a rule neither meters nor, as"
+            " MiDaS's, depth but its inverse; taken for depth": 1
+        }
+    return {}
+
+
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame, (H,W) or (H,W,1), by its header where it has one."""
     try:
@@ -391,7 +386,9 @@ def _is_frame(path: Path) -> bool:
 
 
 def _holds_depth(path: Path) -> bool:
-    """Returns whether a file can be a frame of depth: gray of more than 8 bits."""
+    """Returns whether a file can be a frame of depth: gray of more than 8 bits, by its name not of an infrared camera."""
+    if not says_depth(path.stem) and (_INFRARED.search(path.stem) or _BRIGHTNESS.search(path.stem)):
+        return False
     try:
         return read_frame(path).dtype != np.uint8
     except DataError:
@@ -456,12 +453,15 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
             raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
         times = series.times()
         first = series.paths[0]
-        tiff = first.read_bytes() if first.suffix.lower() in (".tif", ".tiff") else b""
-        turned = _tiff_tag(tiff, _ORIENTATION) not in (None, 1)  # which OpenCV does
-        known = {WHITE_AT_ZERO: int(has_white_at_zero(tiff)), TURNED: int(turned)}
+        data = first.read_bytes() if first.suffix.lower() in (".tif", ".tiff") else b""
+        turned = tiff.read_tags(data).get(tiff.ORIENTATION, (1,))[0] != 1  # which OpenCV does
+        known = {WHITE_AT_ZERO: int(has_white_at_zero(data)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
         told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
+        bits = significant_bits(first) if first.suffix.lower() == ".png" and video.frames.dtype == np.uint16 else 16
+        if bits < 16 and video.frames.max(initial=0) >= 1 << bits:
+            video.notes[SPREAD.format(bits)] = 1
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         try:
             video = _read_file(path, stride)
@@ -491,6 +491,10 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
     frames, time, missing = read_timed_video(path, stride)
     if not frames:
         raise DataError(f"{path}: an empty video: no frame can be decoded")
-    told = {LEFT_OUT: empty_frames(path, 0), TURNED: int(how_shown(path)[1] > 0)}
+    told = {
+        LEFT_OUT: empty_frames(path, 0),
+        TURNED: int(how_shown(path)[1] > 0),
+        JOINED: max(joined_videos(path) - 1, 0),
+    }
     notes = {what: count for what, count in told.items() if count}
     return DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)

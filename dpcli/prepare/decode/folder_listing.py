@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -10,6 +11,12 @@ from pathlib import Path
 from dpcli.errors import DataError
 from dpcli.prepare.series import is_hidden
 from dpcli.regular_files import why_unreadable
+
+_OF_CAMERAS = (".json", ".txt", ".csv", ".yaml", ".yml", ".xml", ".ini", ".npy", ".pincam")  # suffixes of calibrations
+_CAMERA = re.compile(
+    r"intrinsic|calib|(^|[^a-z])cam(era)?s?[-_ ]?(matri|info|param|intr)|^(k|cameras?)$|(^|[-_.])k$", re.IGNORECASE
+)
+_CAMERAS = re.compile(r"intrinsics?$|^cameras?$|^calib", re.IGNORECASE)  # folders of them
 
 
 def leads_out(path: Path, root: Path) -> str:
@@ -48,6 +55,23 @@ def files_below(root: Path) -> list[Path]:
     return sorted(
         Path(folder, name) for folder, _, names in walk_folders(root) for name in names if not is_hidden(name)
     )
+
+
+def calibrations_below(root: Path) -> list[str]:
+    """Returns the files that by their names describe a camera, below a folder, or beside one that holds none: one of each folder."""
+    places = [(folder, names) for folder, _, names in walk_folders(root)] if root.is_dir() else []
+    if above := next((own for own in os.walk(root.absolute().parent)), None):
+        places.append((above[0], above[2]))
+    found: dict[str, list[str]] = {}
+    for folder, names in places:
+        known = _CAMERAS.search(os.path.basename(folder)) is not None
+        for name in names:
+            stem, suffix = os.path.splitext(name)
+            if suffix.lower() in _OF_CAMERAS and not is_hidden(name) and (known or _CAMERA.search(stem)):
+                found.setdefault(folder, []).append(name)
+    return [
+        os.path.relpath(os.path.join(folder, min(names)), root.absolute().parent) for folder, names in found.items()
+    ]
 
 
 def _leads_above(path: str) -> bool:

@@ -53,6 +53,16 @@ def png_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
+def significant_bits(path: Path) -> int:
+    """Returns how many of its bits a gray PNG says are significant; all of them where it doesn't, 16 where it is no PNG."""
+    with open(path, "rb") as file:
+        data = file.read(_HEADER.size + 4096)
+    header, place = read_header(data), data.find(b"\0\0\0\1sBIT", 0, data.find(b"IDAT"))
+    if header is None or header.color != 0:
+        return 16
+    return min(data[place + 8], header.bits) if place > 0 else header.bits
+
+
 @cache
 def _decoders() -> dict[int, Callable]:
     """Returns bits -> function of (bytes, (height, width), mode); none where kornia-rs is missing or of another kind."""
@@ -74,6 +84,8 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
 
     header = read_header(data)
     if header is None or not data.endswith(_END) or header.color != 0 or header.bits not in _decoders():
+        return None
+    if data.find(b"acTL", 0, data.find(b"IDAT")) > 0:  # of an animation it would give the first frame
         return None
     # memory is taken before anything is decoded: a size that can't be true would ask for gigabytes
     if header.checksum != zlib.crc32(data[12:29]) or not is_plausible(header.width, header.height, len(data)):
@@ -115,8 +127,8 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
 
 
 def check_picture(data: bytes, where: str | Path) -> None:
-    """Raises DataError for a picture that claims more pixels than its bytes can tell, and where a PNG's chunks are not all
-    there with the right checksums, the last one IEND.
+    """Raises DataError for a picture that claims more pixels than its bytes can tell, where a PNG's chunks are not all
+    there with the right checksums, the last one IEND, and of a PNG of several frames.
 
     OpenCV gets nothing else: it takes as much memory as a header or a damaged chunk claims.
     """
@@ -135,7 +147,10 @@ def check_picture(data: bytes, where: str | Path) -> None:
             break
         if zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             raise DataError(f"{where}: a damaged PNG: wrong checksum at byte {position}; copy it again")
-        if data[position + 4 : position + 8] == b"IEND":
+        kind = data[position + 4 : position + 8]
+        if kind == b"acTL" and (frames := int.from_bytes(data[position + 8 : position + 12], "big")) > 1:
+            raise DataError(f"{where}: an animated PNG of {frames} frames; expected one: save each as its own file")
+        if kind == b"IEND":
             return
         position = end
     raise DataError(f"{where}: a truncated PNG: it ends after {len(data)} bytes without its end mark; copy it again")

@@ -110,6 +110,18 @@ def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool,
     return woven, turned
 
 
+def cuts_left(path: Path) -> bool:
+    """Returns whether the codec of a file's first video cuts columns off on the left, in whose place OpenCV stretches what it got."""
+    import av
+
+    try:
+        name = "file:" + utf8_path(path, "FFmpeg")
+        with av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace") as container:
+            return next(container.decode(video=0)).width != container.streams.video[0].codec_context.width
+    except (av.FFmpegError, OSError, ValueError, IndexError, StopIteration):
+        return False
+
+
 def _parsed(place: int, text: str) -> VideoStream:
     """Returns a stream from ffmpeg's words for it: ``png (MPNG / 0x474E504D), gray16be(pc, progressive), 32x24, ...``."""
     parts = [part.strip() for part in re.split(r",(?![^(]*\))", text)]

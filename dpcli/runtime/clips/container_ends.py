@@ -66,6 +66,16 @@ def promised_frames(path: Path) -> int:
     return int.from_bytes(head[48:52], "little") if int.from_bytes(head[56:60], "little") == 1 else 0
 
 
+def joined_videos(path: Path) -> int:
+    """Returns how many videos of MP4 or QuickTime a file holds one behind another, of which decoders read the first, or in pieces
+    a part of the others; 0 for other files.
+    """
+    with path.open("rb") as file:
+        if file.read(8)[4:] != b"ftyp":
+            return 0
+        return sum(name == b"ftyp" for name, _ in _each_box(file, os.path.getsize(path)))
+
+
 def pictures_in(path: Path) -> int:
     """Returns how many pictures lie in an APNG or animated WebP, whatever its header counts; 0 for other files."""
     found, size = 0, os.path.getsize(path)
@@ -93,14 +103,20 @@ def _goes_on(ends: Iterator[int], size: int) -> bool:
     return last < size
 
 
-def _boxes(file: BinaryIO, _head: bytes, size: int) -> bool:
-    """Checks MP4 and QuickTime: boxes one after the other, each with its length before it; zeros may fill the rest."""
+def _each_box(file: BinaryIO, size: int) -> Iterator[tuple[bytes, int]]:
+    """Yields the name of each box of MP4 and QuickTime, one after the other with its length before it, and where it ends."""
     at = 0
     while at + 8 <= size:
         file.seek(at)
-        length, long = int.from_bytes(file.read(4), "big"), file.read(12)[4:]
+        length, name, long = int.from_bytes(file.read(4), "big"), file.read(4), file.read(8)
         length = int.from_bytes(long, "big") if length == 1 else length or size - at
         at += max(length, 8)
+        yield name, at
+
+
+def _boxes(file: BinaryIO, _head: bytes, size: int) -> bool:
+    """Checks MP4 and QuickTime; zeros may fill the rest."""
+    at = max((end for _, end in _each_box(file, size)), default=0)
     file.seek(min(at, size))
     return at > size or any(file.read(8))
 
@@ -170,7 +186,7 @@ def _yuv4mpeg(file: BinaryIO, head: bytes, size: int) -> bool:
     sides = [found.get(key, "") for key in (b"W", b"H")]
     if not planes or not all(side.isdigit() for side in sides):
         return False
-    deep = 2 if re.search(r"p(9|1\d)", found.get(b"C", "")) else 1
+    deep = 2 if re.search(r"(p|mono)(9|1\d)", found.get(b"C", "")) else 1
     width, height = map(int, sides)
     odd = {1.5: ((width + 1) // 2) * ((height + 1) // 2) * 2, 2.0: (width + 1) // 2 * height * 2}
     frame = (width * height + odd.get(planes, round((planes - 1) * width * height))) * deep

@@ -19,7 +19,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
-from dpcli.runtime.clips.container_ends import VIDEO_FORMATS, empty_frames, ends_early, promised_frames
+from dpcli.runtime.clips.container_ends import VIDEO_FORMATS, empty_frames, ends_early, joined_videos, promised_frames
 from dpcli.runtime.clips.cropping import Margins, entry_box, margins
 from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix, more_than_a_picture
 from dpcli.runtime.clips.other_files import no_video
@@ -245,6 +245,11 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
     if left := empty_frames(path, stream.index):
         log.warn(
             f"{path}: {counted(left, 'frame')} without bytes: the program that recorded it left them out, and so does this"
+        )
+    if (joined := joined_videos(path)) > 1:
+        log.warn(
+            f"{path}: holds {joined} videos, one behind another, of which only the first is sure to be read; join them by"
+            " ffmpeg -f concat instead"
         )
     if cut:
         log.warn(f"{path}: the file ends before its container does; frames after the {held} that it holds may be lost")

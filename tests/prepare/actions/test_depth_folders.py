@@ -214,6 +214,7 @@ def test_openexr_colors_and_damaged_files_are_named(tmp_path):
         ("scene/lowres_depth", ["scene/lowres_wide_confidence"]),
         ("depth/anna", ["confidence/anna", "ir/anna"]),
         ("depth", ["depth_vis", "masks"]),
+        ("depth_left", ["seg_left"]),
     ],
 )
 def test_folders_beside_depth_are_left_out_by_name(tmp_path, depth_at, beside):
@@ -253,6 +254,40 @@ def test_a_take_that_a_letter_counts_is_no_folder_of_depth(tmp_path, names):
         write(tmp_path / "push" / name, **{f"{t:03}": depth(1000 + t) for t in range(3)})
     reader = DepthVideos(inputs=(tmp_path,))
     assert [item.name for item in reader.items()] == [f"push/{name}" for name in sorted(names)]
+
+
+def test_brightness_beside_each_frame_is_left_out_and_the_advised_pattern_takes_one_series(tmp_path):
+    folder = write(tmp_path / "v", **{f"{t}{end}": depth(1000 + t) for t in (0, 1) for end in ("", "_ab")})
+    reader, sequence = read(folder)
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert any("left out: *_ab.png (2 files)" in line for line in reader.summary(reader.items()))
+    folder = write(tmp_path / "w", **{f"{t}{end}": depth(1000 + t) for t in (0, 1) for end in ("", "_b")})
+    with pytest.raises(DataError, match="holds 2 series") as told:
+        read(folder)
+    assert first_depths(read(folder, pattern=str(told.value).split("'")[1])[1]) == [1.0, 1.001]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "camera_matrix.csv",
+        "intrinsic/intrinsic_depth.txt",
+        "cam_params.json",
+        "cameras/17.json",
+        "K.txt",
+        "../calib.txt",
+    ],
+)
+def test_a_camera_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
+    write(tmp_path / "scene" / "depth", **{"0": depth(1000), "1": depth(1001)})
+    place = tmp_path / "scene" / name
+    place.parent.mkdir(exist_ok=True)
+    place.write_text("50 0 4\n0 50 3\n0 0 1\n")
+    (tmp_path / "scene" / "scale.txt").write_text("1")
+    readers = [DepthVideos(inputs=(tmp_path / "scene",), fov=fov) for fov in (None, 60)]
+    told = [reader.summary(reader.items()) for reader in readers]
+    said = f"{'scene/' if name[0] != '.' else ''}{name.removeprefix('../')}: not read; if the camera is in there"
+    assert [any(line.startswith(said) for line in lines) for lines in told] == [True, False]
 
 
 def test_a_topic_without_a_recording_is_refused(tmp_path):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import zlib
+
+import cv2
 import numpy as np
 import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.actions.depth_units import LIKE_KITTI, require_plausible, without_marks
+from dpcli.prepare.actions.depth_units import LIKE_KITTI, UP_TO_ONE, require_plausible, without_marks
+from dpcli.prepare.decode.depth_files import SPREAD
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.scans.clouds import CloudFolders
@@ -105,6 +109,42 @@ def test_wide_pictures_with_few_depths_may_be_those_of_kitti(tmp_path):
         assert not sample_of(tmp_path / "v.npy", wide, depth_scale=scale).notes
     assert not sample_of(tmp_path / "v.npy", wide[:, :, :100]).notes
     assert not sample_of(tmp_path / "v.npy", np.where(wide == 0, 5001, wide)).notes
+
+
+def test_floats_that_end_at_one_may_be_shares_of_a_range(tmp_path):
+    shares = np.minimum(SCENE / 1200, 1).astype(np.float32)
+    assert sample_of(tmp_path / "v.npy", shares).notes == {UP_TO_ONE: 1}
+    assert not sample_of(tmp_path / "v.npy", shares, depth_scale=1).notes
+    for meters in (shares * 0.99, shares + 0.001 * (shares == 1), np.ones_like(shares)):
+        assert not sample_of(tmp_path / "v.npy", meters).notes
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("frame.{}.depth_meters", "depth_meters"),
+        ("distance_{}", "distance"),
+        ("{}-dpt_beit_large_512", "dpt_beit"),
+        ("depth_{}", ""),
+        ("distances_walked_at_{}", "distances"),
+        ("instance_{}", ""),
+    ],
+)
+def test_names_that_speak_against_depth_in_meters_are_told(tmp_path, name, said):
+    for frame in range(2):
+        np.save(tmp_path / f"{name.format(frame)}.npy", np.full((6, 8), 1.5, np.float32))
+    reader = DepthVideos(inputs=(tmp_path,))
+    notes = reader.read(reader.items()[0], RNG).notes
+    assert [f"({said})" in note for note in notes] == [True] * bool(said)
+
+
+@pytest.mark.parametrize(("significant", "most", "told"), [(12, 40000, True), (12, 4000, False), (16, 40000, False)])
+def test_pngs_whose_numbers_were_spread_over_all_bits_are_told(tmp_path, significant, most, told):
+    data = cv2.imencode(".png", np.linspace(500, most, 48).astype(np.uint16).reshape(6, 8))[1].tobytes()
+    chunk = b"sBIT" + bytes([significant])
+    (tmp_path / "0.png").write_bytes(data[:33] + b"\0\0\0\1" + chunk + zlib.crc32(chunk).to_bytes(4, "big") + data[33:])
+    reader = DepthVideos(inputs=(tmp_path,))
+    assert list(reader.read(reader.items()[0], RNG).notes) == [SPREAD.format(significant)] * told
 
 
 def test_bytes_the_wrong_way_round_are_no_depth(tmp_path):

@@ -234,3 +234,36 @@ def test_frames_that_are_interlaced_behind_others_are_refused(tmp_path):
     assert how_shown(tmp_path / "a.mkv") == (False, 0) and how_shown(tmp_path / "a.mkv", every=True) == (True, 0)
     with pytest.raises(DataError, match="interlaced"):
         read_depth_video(tmp_path / "a.mkv")
+
+
+def test_raw_gray_of_quicktime_whose_white_is_unknown_is_refused(tmp_path):
+    """Of ffmpeg's own files ffmpeg gives 255 less the numbers that were written."""
+    frames = np.arange(48 * 64, dtype=np.uint8).reshape(1, 48, 64)
+    with pytest.raises(DataError, match="raw gray of 8 bits in QuickTime"):
+        read_depth_video(encode(tmp_path / "a.mov", frames, "gray", "rawvideo"))
+    for name, codec in (("a.mkv", "rawvideo"), ("b.mov", "ffv1")):
+        np.testing.assert_array_equal(read_depth_video(encode(tmp_path / name, frames, "gray", codec)).frames, frames)
+
+
+def test_columns_that_a_codec_cuts_off_on_the_left_are_refused(tmp_path):
+    """OpenCV stretches the uncut picture to the size of the cut one."""
+    whole = encode(tmp_path / "a.mp4", frames_of(8).astype(np.uint8), "gray", "libx264")
+    for cut, refused in (("crop_left=8", True), ("crop_right=8", False)):
+        command = [
+            get_ffmpeg_exe(),
+            "-v",
+            "error",
+            "-y",
+            "-i",
+            str(whole),
+            "-c",
+            "copy",
+            "-bsf:v",
+            f"h264_metadata={cut}",
+        ]
+        subprocess.run([*command, str(tmp_path / "b.mp4")], check=True)
+        if refused:
+            with pytest.raises(DataError, match="margins of its frames are cut off"):
+                read_depth_video(tmp_path / "b.mp4")
+        else:
+            assert read_depth_video(tmp_path / "b.mp4").frames.shape == (3, 48, 56)

@@ -133,19 +133,62 @@ def test_a_tiff_that_is_shown_turned_is_told(tmp_path, orientation):
     assert video.notes == ({TURNED: 1} if orientation == 6 else {})
 
 
+def tiff_of(data: bytes, shape: tuple[int, int], tags: dict[int, int]) -> bytes:
+    """Returns a TIFF of one strip that holds these bytes, of a picture (H,W), with tags beside those of every one."""
+    plain = {256: shape[1], 257: shape[0], 259: 1, 262: 1, 273: 8, 277: 1, 278: shape[0], 279: len(data)}
+    told = sorted((plain | tags).items())
+    entries = b"".join(struct.pack("<HHII", tag, 4 if tag in (273, 279) else 3, 1, value) for tag, value in told)
+    even = data + bytes(len(data) % 2)
+    return b"II*\0" + struct.pack("<I", 8 + len(even)) + even + struct.pack("<H", len(told)) + entries + bytes(4)
+
+
 @pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
 def test_white_at_zero_is_told_and_changes_no_number(tmp_path, kind):
     frame = np.arange(10, 30).reshape(4, 5).astype(kind)
-    bits, form = 8 * frame.itemsize, 3 if kind == "f4" else 1
-    tags = [(256, 5), (257, 4), (258, bits), (259, 1), (262, 0), (273, 8), (277, 1), (278, 4), (279, frame.nbytes)]
-    tags = sorted([*tags, (339, form)])
-    entries = b"".join(struct.pack("<HHII", tag, 4 if tag in (273, 279) else 3, 1, value) for tag, value in tags)
-    data = frame.tobytes() + struct.pack("<H", len(tags)) + entries + bytes(4)
-    (tmp_path / "0.tif").write_bytes(b"II*\0" + struct.pack("<I", 8 + frame.nbytes) + data)
+    tags = {258: 8 * frame.itemsize, 262: 0, 339: 3 if kind == "f4" else 1}
+    (tmp_path / "0.tif").write_bytes(tiff_of(frame.tobytes(), frame.shape, tags))
     np.testing.assert_array_equal(read_frame(tmp_path / "0.tif"), frame)
     assert read_depth_video(tmp_path).notes == {WHITE_AT_ZERO: 1}
     Image.fromarray(frame).save(tmp_path / "0.tif")
     assert read_depth_video(tmp_path).notes == {}
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_tiffs_of_ten_to_fourteen_bits_keep_their_numbers(tmp_path, bits):
+    frame = np.random.default_rng(0).integers(0, 1 << bits, (4, 8)).astype(np.uint16)
+    packed = np.packbits((frame[..., None] >> np.arange(bits)[::-1] & 1).astype(np.uint8))
+    (tmp_path / "0.tif").write_bytes(tiff_of(packed.tobytes(), frame.shape, {258: bits}))
+    np.testing.assert_array_equal(read_frame(tmp_path / "0.tif"), frame)
+
+
+@pytest.mark.parametrize(
+    ("tags", "words"),
+    [
+        ({258: 8, 259: 34712}, "whose compression"),  # JPEG 2000, which OpenCV gives as zeros
+        ({258: 16, 259: 32773, 317: 2}, "whose compression"),  # differences, which it gives as they are
+        ({258: 16, 277: 2}, "holds 2 channels of gray"),
+        ({258: 8, 277: 3, 284: 2}, "holds 3 channels of gray"),
+        ({258: 4}, "4 bits a pixel"),
+    ],
+)
+def test_tiffs_that_opencv_would_change_are_refused(tmp_path, tags, words):
+    (tmp_path / "0.tif").write_bytes(tiff_of(bytes(80), (4, 5), tags))
+    with pytest.raises(DataError, match=f"0.tif: .*{words}"):
+        read_frame(tmp_path / "0.tif")
+
+
+def test_portable_maps_of_several_pictures_or_of_one_bit_are_refused(tmp_path):
+    frame = np.arange(3000, 3020, dtype=np.uint16).reshape(4, 5)
+    one = b"P5 # by a program\n5 4\n65535\n" + frame.astype(">u2").tobytes()
+    path = tmp_path / "0.pgm"
+    path.write_bytes(one)
+    np.testing.assert_array_equal(read_frame(path), frame)
+    path.write_bytes(one + one)
+    with pytest.raises(DataError, match="0.pgm: holds several pictures, one behind another"):
+        read_frame(path)
+    path.write_bytes(b"P4\n5 4\n" + bytes(range(4)))
+    with pytest.raises(DataError, match="0.pgm: 1 bit a pixel"):
+        read_frame(path)
 
 
 def test_pictures_that_opencv_would_change_are_refused(tmp_path):
@@ -196,3 +239,39 @@ def test_what_stands_in_for_a_file_is_told(tmp_path, name):
     (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n")
     with pytest.raises(DataError, match=f"{name}: a pointer of Git LFS; `git lfs pull` brings the file itself"):
         read_depth_video(tmp_path if name.endswith(("png", "tif")) else tmp_path / name)
+
+
+@pytest.mark.parametrize("corner", [(10, 5), (-3, -2), (90, -4), (0, 0)])
+def test_the_frame_of_an_openexr_is_its_display_window(tmp_path, corner):
+    openexr = pytest.importorskip("OpenEXR")
+    pixels = np.random.default_rng(0).uniform(1, 2, (6, 20)).astype(np.float32)
+    (x, y), (height, width) = corner, (9, 100)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    windows = {"dataWindow": (x, y, x + 19, y + 5), "displayWindow": (0, 0, width - 1, height - 1)}
+    header |= {name: tuple(np.array(own, np.int32).reshape(2, 2)) for name, own in windows.items()}
+    openexr.File(header, {"Z": pixels}).write(str(tmp_path / "a.exr"))
+    wide = np.zeros((height + 20, width + 40), np.float32)  # the picture and 10 rows, 20 columns around it
+    wide[y + 10 : y + 16, x + 20 : x + 40] = pixels
+    np.testing.assert_array_equal(read_frame(tmp_path / "a.exr"), wide[10:-10, 20:-20])
+
+
+def test_the_z_of_a_normal_is_no_depth_and_disparities_are_refused(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    path, frame = tmp_path / "a.exr", np.random.default_rng(0).uniform(1, 2, (6, 8)).astype(np.float32)
+    normal = {f"Normal.{axis}": np.full_like(frame, value) for axis, value in zip("XYZ", (0.6, 0.0, 0.8))}
+    openexr.File(dict(header), normal).write(str(path))
+    with pytest.raises(DataError, match=r"holds channels Normal\.X, Normal\.Y, Normal\.Z; expected one called Z"):
+        read_frame(path)
+    openexr.File(dict(header), {**normal, "Layer.Depth.Z": frame}).write(str(path))
+    np.testing.assert_array_equal(read_frame(path), frame)
+    openexr.File(dict(header), {"disparity": frame}).write(str(path))
+    with pytest.raises(DataError, match="by its name it holds disparities"):
+        read_frame(path)
+    deep = np.empty(frame.shape, object)
+    for place in np.ndindex(frame.shape):
+        deep[place] = np.full(2, 1.5, np.float32)
+    header |= {"compression": openexr.ZIPS_COMPRESSION, "type": openexr.deepscanline}
+    openexr.File(header, {"Z": deep, "A": deep}).write(str(path))
+    with pytest.raises(DataError, match="holds deep pixels"):
+        read_frame(path)

@@ -157,3 +157,13 @@ def test_readers_give_the_same_without_kornia(tmp_path, monkeypatch, dtype):
         assert one.dtype == other.dtype == dtype
         np.testing.assert_array_equal(one, image)
         np.testing.assert_array_equal(other, image)
+
+
+def test_an_animated_one_is_refused_and_one_of_one_frame_read(tmp_path):
+    frames = [Image.fromarray(image_of((6, 8), np.uint8) + add) for add in range(3)]
+    frames[0].save(tmp_path / "0.png", save_all=True, append_images=frames[1:])
+    with pytest.raises(DataError, match=r"0.png: an animated PNG of 3 frames; expected one"):
+        read_image(tmp_path / "0.png")
+    data = png(np.asarray(frames[0]))
+    (tmp_path / "1.png").write_bytes(data[:33] + chunk(b"acTL", struct.pack(">II", 1, 0)) + data[33:])
+    np.testing.assert_array_equal(read_image(tmp_path / "1.png"), np.asarray(frames[0]))

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.depth_files import read_depth_video
+from dpcli.prepare.decode.depth_files import JOINED, read_depth_video
 from dpcli.runtime.clips.animations import animation_times
 from dpcli.runtime.clips.container_ends import ends_early
 from dpcli.runtime.clips.video_frames import look_at_video
@@ -25,6 +25,7 @@ CONTAINERS = {
     "a.wmv": ("wmv2", "yuv420p", {}),
     "a.y4m": ("wrapped_avframe", "yuv420p", {}),
     "full.y4m": ("wrapped_avframe", "yuv444p", {}),
+    "deep.y4m": ("wrapped_avframe", "gray16le", {"options": {"strict": "-1"}}),
     "deep.nut": ("ffv1", "gray16le", {}),
     "deep.mkv": ("ffv1", "gray16le", {}),
 }
@@ -79,6 +80,16 @@ def test_depth_says_what_is_missing_down_to_one_frame(name, tmp_path):
         video = read_depth_video(path)
         assert video.ends_early and len(video.frames) < FRAMES
         assert name == "deep.nut" or len(video.frames) + video.missing == FRAMES  # NUT counts nothing
+
+
+def test_videos_one_behind_another_in_a_file_are_told(tmp_path, monkeypatch):
+    path, said = write(tmp_path / "a.mp4", *CONTAINERS["a.mp4"]), []
+    assert JOINED not in read_depth_video(path).notes
+    path.write_bytes(3 * path.read_bytes())
+    assert read_depth_video(path).notes[JOINED] == 2
+    monkeypatch.setattr(log, "warn", said.append)
+    look_at_video(path)
+    assert any("holds 3 videos, one behind another" in line for line in said)
 
 
 def test_a_live_recording_promises_no_end(tmp_path):

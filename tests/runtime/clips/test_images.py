@@ -295,3 +295,40 @@ def test_channels_of_a_tiff_may_lie_one_after_the_other(tmp_path, order, kind, c
     with open_image(tmp_path / "a.tif") as image:
         found = np.asarray(as_shown(image).convert("RGBA")).astype(int)
     np.testing.assert_allclose(found[..., :channels], straight, atol=6 if alpha == 1 else 1)
+
+
+def gray_tiff(data: bytes, order: str, tags: dict[int, int]) -> bytes:
+    """Returns a TIFF of one strip of 4x3 gray pixels in this byte order ("<" or ">"), with tags beside those of every one."""
+    told = sorted(({256: 4, 257: 3, 259: 1, 262: 1, 273: 8, 277: 1, 278: 3, 279: len(data)} | tags).items())
+    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in told)
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8 + len(data))
+    return head + data + struct.pack(f"{order}H", len(told)) + entries + bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "tags", "words"),
+    [
+        ("<u2", {258: 12}, "a TIFF of 12 bits a channel"),  # nearly black in Pillow
+        ("<u4", {258: 32}, "gray from -?[0-9]+ to [0-9]+; expected 0 to 255"),  # white
+        (">f4", {258: 32, 259: 8, 339: 3}, "compressed numbers of 32 bits, high byte first"),  # any numbers at all
+        (">i2", {258: 16, 259: 8, 339: 2}, "compressed numbers of 16 bits, high byte first"),
+    ],
+)
+def test_gray_that_pillow_changes_is_refused(tmp_path, kind, tags, words):
+    data = np.linspace(1, 2**31 if kind == "<u4" else 200, 12).astype(kind).tobytes()
+    (tmp_path / "a.tif").write_bytes(gray_tiff(zlib.compress(data) if tags.get(259) else data, kind[0], tags))
+    with pytest.raises(DataError, match=f"a.tif: {words}"):
+        read_rgba(tmp_path / "a.tif")
+
+
+def test_the_gamma_of_gray_counts_in_sixteen_bits_as_in_eight(tmp_path):
+    gray = np.linspace(0, 255, 48).astype(np.uint8).reshape(6, 8)
+    for name, own in (("8", gray), ("16", gray.astype(np.uint16) * 257)):
+        Image.fromarray(own).save(tmp_path / f"{name}.png")
+        data = (tmp_path / f"{name}.png").read_bytes()
+        chunk = b"gAMA" + struct.pack(">I", 100_000)
+        told = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        (tmp_path / f"{name}.png").write_bytes(data[:33] + told + data[33:])
+    eight, sixteen = (read_rgba(tmp_path / f"{name}.png") for name in ("8", "16"))
+    np.testing.assert_array_equal(sixteen, eight)
+    assert not np.array_equal(eight[..., 0], gray)
