@@ -208,6 +208,25 @@ def test_surfaces_have_one_shape_in_any_unit_and_place(place, unit, flat):
     assert np.allclose(np.ptp(found, 0), unit * np.ptp(shape, 0), rtol=0.01)
 
 
+def test_copies_of_points_change_no_joint(few, tmp_path):
+    with PartsReader(few) as reader:
+        options = {"num_parts": reader.num_parts, "class_names": reader.class_names, "length_unit": reader.length_unit}
+        with PartsWriter(tmp_path / "copied.h5", **options) as writer:
+            for index in range(len(reader)):
+                sequence, said = reader.read(index), reader.read_parts(index)
+                parts = np.split(sequence.part, sequence.frame_offsets[1:-1])
+                frames = [np.concatenate([frame, frame]) for frame in map(sequence.frame, range(sequence.num_frames))]
+                own = CloudSequence.from_frames(sequence.name, frames, part=[np.tile(part, 2) for part in parts])
+                share, flow = (
+                    np.eye(reader.num_parts, dtype=np.float32)[own.part],
+                    [np.tile(f, (2, 1)) for f in said.flow],
+                )
+                writer.write(own, share, said.pairs, said.motion, flow)
+    for path, output in ((few, "one.json"), (tmp_path / "copied.h5", "two.json")):
+        find_joints(str(path), tmp_path / output, sequence=None, picture=None, force=False)
+    assert (tmp_path / "one.json").read_bytes() == (tmp_path / "two.json").read_bytes()
+
+
 def test_points_that_lie_on_one_another_have_joints_without_certainty(tmp_path):
     frames, still = [np.zeros((60, 3), np.float32)] * 3, np.tile(np.eye(4, dtype=np.float32), (2, 2, 1, 1))
     cloud = CloudSequence.from_frames("same", frames, part=[np.repeat([0, 1], 30)] * 3)
