@@ -17,7 +17,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.whole_file import PICTURES, check_target, make_folder, refuse_existing, refuse_replacing, whole_file
 from dpcli.segment.frame_pairs import first_copies
 from dpcli.segment.kinematics.joints_picture import joints_picture
-from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
+from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree, unseen_motions
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
 from dpcli.segment.multibody.axis_choice import with_point_axes
 from dpcli.store import CloudSequence, input_file, output_file
@@ -70,7 +70,7 @@ Trees = Generator[tuple[int, CloudSequence, KinematicTree], None, None]
 
 
 def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:
-    late = []
+    late, unseen = [], []
     with Progress("joints", len(chosen), "sequence") as progress:
         for number, index in enumerate(chosen):
             sequence = reader.read(index)
@@ -80,6 +80,7 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
             tree = with_point_axes(once, kinematic_tree(once, reader.read_parts(index)))
             counts.update(joint_counts(tree))
             late += [f"part {part} of {sequence.name}" for part in tree.trajectories.ids[~tree.trajectories.seen[0]]]
+            unseen += [f"part {child} on part {parent} of {sequence.name}" for child, parent in unseen_motions(tree)]
             if picture is not None and number == 0:
                 joints_picture(picture, tree, sequence.name)
             yield index, sequence, tree
@@ -88,6 +89,11 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
         log.warn(
             f"{reader.path}: hardly a point in frame 0, so that the place there, and with it the joint, is a guess:"
             f" {first_names(late)}"
+        )
+    if unseen:
+        log.warn(
+            f"{reader.path}: joints called fixed, since points don't show the motion that the file tells (too few, or alike"
+            f" before and after it; more points may): {first_names(unseen)}"
         )
 
 

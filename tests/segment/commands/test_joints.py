@@ -263,6 +263,29 @@ def test_a_part_that_frame_0_does_not_show_is_told(hidden, tmp_path, capsys):
     assert ("is a guess: part 1 of second\n" in capsys.readouterr().err) == hidden
 
 
+@pytest.mark.parametrize(("turn", "said"), [(0.0, 0), (0.8, 1)])
+def test_a_turn_that_points_do_not_show_is_told(turn, said, tmp_path, capsys):
+    """A disk of few points spins on a box, and looks as before: its joint is fixed, but not in silence."""
+    rng, frames, motions = np.random.default_rng(0), [], []
+    for t in range(3):
+        motion = np.eye(4)
+        motion[:2, :2] = [[np.cos(turn * t), -np.sin(turn * t)], [np.sin(turn * t), np.cos(turn * t)]]
+        body, angle = rng.uniform(-0.5, 0.5, (80, 3)), rng.uniform(0, 2 * np.pi, 10)
+        body[np.arange(80), rng.integers(0, 3, 80)] = 0.5  # three faces
+        radius = 0.2 * np.sqrt(rng.uniform(size=10))
+        disk = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(10, 0.55)])
+        frames.append(np.float32(np.concatenate([body, disk])))
+        motions.append(motion)
+    cloud = CloudSequence.from_frames("cap", frames, part=[np.repeat([0, 1], [80, 10])] * 3)
+    steps = np.stack([np.stack([np.eye(4), motions[t + 1] @ np.linalg.inv(motions[t])]) for t in range(2)])
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, class_names=[], length_unit="m") as writer:
+        share, flow = np.eye(2, dtype=np.float32)[cloud.part], [np.zeros((90, 3), np.float32)] * 2
+        writer.write(cloud, share, np.array([(0, 1), (1, 2)]), steps, flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
+    assert json.loads((tmp_path / "j.json").read_text())[0]["joints"][0]["type"] == "fixed"
+    assert capsys.readouterr().err.count("called fixed") == said
+
+
 def test_one_frame_has_no_joints(tmp_path):
     cloud = CloudSequence.from_frames("still", [np.eye(3, dtype=np.float32)], part=[np.arange(3)])
     with PartsWriter(tmp_path / "p.h5", num_parts=3, class_names=[], length_unit="m") as writer:
