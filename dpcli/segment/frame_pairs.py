@@ -64,6 +64,15 @@ def without_strays(frame: np.ndarray) -> np.ndarray:
     return frame[distance <= far[apart[0]]] if len(apart) else frame
 
 
+def first_copies(points: np.ndarray) -> np.ndarray:
+    """Returns the indices, ascending, of the points (N,D) that no earlier one equals.
+
+    >>> first_copies(np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])).tolist()
+    [0, 1]
+    """
+    return np.sort(np.unique(points, axis=0, return_index=True)[1])
+
+
 def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
     """Returns random indices i64 (wanted) into `count` points.
 

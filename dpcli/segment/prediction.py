@@ -14,7 +14,7 @@ from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
-from dpcli.segment.frame_pairs import choose_points, sequence_scale, without_strays
+from dpcli.segment.frame_pairs import choose_points, first_copies, sequence_scale, without_strays
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
@@ -127,13 +127,20 @@ def _prepare_frames(
 
 
 def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
-    """Returns at most so many far-apart points of a cloud, and at least `_FEWEST`, some of them twice if need be."""
+    """Returns at most so many far-apart points of a cloud, and at least `_FEWEST`.
+
+    A point that a file holds several times is looked at once, since its copies would make the cloud seem denser, and its
+    errors smaller, than they are; only too few points are filled up by repeats.
+    """
     if len(cloud) == 0:
         return torch.zeros(_FEWEST, 3)
-    if len(cloud) <= most:
-        return cloud if len(cloud) >= _FEWEST else cloud[choose_points(len(cloud), _FEWEST, rng)]
-    some = cloud[np.sort(choose_points(len(cloud), min(len(cloud), _SPREAD * most), rng))]
-    return some[fps(some[None], most)[0]]
+    some = cloud
+    if len(cloud) > most:
+        some = cloud[np.sort(choose_points(len(cloud), min(len(cloud), _SPREAD * most), rng))]
+    some = some[first_copies(some.numpy())]
+    if len(some) < _FEWEST:
+        return some[choose_points(len(some), _FEWEST, rng)]
+    return some[fps(some[None], most)[0]] if len(some) > most else some
 
 
 def _find_masks_and_motions(

@@ -101,6 +101,26 @@ def test_frames_without_points_change_nothing_for_the_others(empty, pairs):
             assert (motion == np.eye(4)).all() and not flow.any()
 
 
+@pytest.mark.parametrize("copied", [slice(None), slice(0, 7), slice(59, None)])
+def test_copies_of_points_change_nothing(copied):
+    """A segmenter sees each point of a frame once: vertices that faces share, and frames padded to one size, are no more points."""
+    sequence = drawer("d", 5)
+    frames = [sequence.frame(t) for t in range(sequence.num_frames)]
+    padded = CloudSequence.from_frames("d", [np.concatenate([frame, *[frame[copied]] * 3]) for frame in frames])
+
+    def still(first, second):
+        return torch.zeros_like(first), torch.zeros_like(second)
+
+    plain, few = predict_parts(sequence, 0, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
+    found, said = predict_parts(padded, 0, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
+    np.testing.assert_allclose(said.motion, few.motion, atol=1e-6)  # the center of the scaling may be another
+    for t, frame in enumerate(frames):
+        own = found[padded.frame_offsets[t] : padded.frame_offsets[t + 1]]
+        once = plain[sequence.frame_offsets[t] : sequence.frame_offsets[t + 1]]
+        np.testing.assert_array_equal(own, np.concatenate([once, *[once[copied]] * 3]))
+        assert len(own) > len(frame)
+
+
 def test_poor_sequences_get_an_answer():
     def anything(frames, flows):
         return [torch.softmax(torch.randn(len(f), 4, generator=torch.Generator().manual_seed(0)), 1) for f in frames]

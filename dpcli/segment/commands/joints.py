@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import file_names, first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.whole_file import PICTURES, check_target, make_folder, refuse_existing, refuse_replacing, whole_file
+from dpcli.segment.frame_pairs import first_copies
 from dpcli.segment.kinematics.joints_picture import joints_picture
-from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
+from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree, unseen_motions
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
 from dpcli.segment.multibody.axis_choice import with_point_axes
 from dpcli.store import CloudSequence, input_file, output_file
@@ -66,15 +70,17 @@ Trees = Generator[tuple[int, CloudSequence, KinematicTree], None, None]
 
 
 def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:
-    late = []
+    late, unseen = [], []
     with Progress("joints", len(chosen), "sequence") as progress:
         for number, index in enumerate(chosen):
             sequence = reader.read(index)
             if not (sequence.part >= 0).any():
                 raise DataError(f"{reader.path}: {sequence.name!r} has no point in any part; predict its parts first")
-            tree = with_point_axes(sequence, kinematic_tree(sequence, reader.read_parts(index)))
+            once = _without_copies(sequence)
+            tree = with_point_axes(once, kinematic_tree(once, reader.read_parts(index)))
             counts.update(joint_counts(tree))
             late += [f"part {part} of {sequence.name}" for part in tree.trajectories.ids[~tree.trajectories.seen[0]]]
+            unseen += [f"part {child} on part {parent} of {sequence.name}" for child, parent in unseen_motions(tree)]
             if picture is not None and number == 0:
                 joints_picture(picture, tree, sequence.name)
             yield index, sequence, tree
@@ -84,6 +90,20 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
             f"{reader.path}: hardly a point in frame 0, so that the place there, and with it the joint, is a guess:"
             f" {first_names(late)}"
         )
+    if unseen:
+        log.warn(
+            f"{reader.path}: joints called fixed, since points don't show the motion that the file tells (too few, or alike"
+            f" before and after it; more points may): {first_names(unseen)}"
+        )
+
+
+def _without_copies(sequence: CloudSequence) -> CloudSequence:
+    """Returns the sequence with each point of a frame's part once: copies would make distances between neighbors 0."""
+    frame = np.repeat(np.arange(sequence.num_frames), np.diff(sequence.frame_offsets))
+    rows = first_copies(np.column_stack([frame, sequence.part, sequence.points.astype(np.float64)]))
+    once = replace(sequence)
+    once.take_points(rows, np.searchsorted(frame[rows], np.arange(sequence.num_frames + 1)))
+    return once
 
 
 def _write_parts(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:

@@ -208,6 +208,25 @@ def test_surfaces_have_one_shape_in_any_unit_and_place(place, unit, flat):
     assert np.allclose(np.ptp(found, 0), unit * np.ptp(shape, 0), rtol=0.01)
 
 
+def test_copies_of_points_change_no_joint(few, tmp_path):
+    with PartsReader(few) as reader:
+        options = {"num_parts": reader.num_parts, "class_names": reader.class_names, "length_unit": reader.length_unit}
+        with PartsWriter(tmp_path / "copied.h5", **options) as writer:
+            for index in range(len(reader)):
+                sequence, said = reader.read(index), reader.read_parts(index)
+                parts = np.split(sequence.part, sequence.frame_offsets[1:-1])
+                frames = [np.concatenate([frame, frame]) for frame in map(sequence.frame, range(sequence.num_frames))]
+                own = CloudSequence.from_frames(sequence.name, frames, part=[np.tile(part, 2) for part in parts])
+                share, flow = (
+                    np.eye(reader.num_parts, dtype=np.float32)[own.part],
+                    [np.tile(f, (2, 1)) for f in said.flow],
+                )
+                writer.write(own, share, said.pairs, said.motion, flow)
+    for path, output in ((few, "one.json"), (tmp_path / "copied.h5", "two.json")):
+        find_joints(str(path), tmp_path / output, sequence=None, picture=None, force=False)
+    assert (tmp_path / "one.json").read_bytes() == (tmp_path / "two.json").read_bytes()
+
+
 def test_points_that_lie_on_one_another_have_joints_without_certainty(tmp_path):
     frames, still = [np.zeros((60, 3), np.float32)] * 3, np.tile(np.eye(4, dtype=np.float32), (2, 2, 1, 1))
     cloud = CloudSequence.from_frames("same", frames, part=[np.repeat([0, 1], 30)] * 3)
@@ -242,6 +261,29 @@ def test_a_part_that_frame_0_does_not_show_is_told(hidden, tmp_path, capsys):
     said = predicted(tmp_path / "parts.h5", sequences)
     find_joints(str(said), tmp_path / "joints.json", sequence=None, picture=None, force=False)
     assert ("is a guess: part 1 of second\n" in capsys.readouterr().err) == hidden
+
+
+@pytest.mark.parametrize(("turn", "said"), [(0.0, 0), (0.8, 1)])
+def test_a_turn_that_points_do_not_show_is_told(turn, said, tmp_path, capsys):
+    """A disk of few points spins on a box, and looks as before: its joint is fixed, but not in silence."""
+    rng, frames, motions = np.random.default_rng(0), [], []
+    for t in range(3):
+        motion = np.eye(4)
+        motion[:2, :2] = [[np.cos(turn * t), -np.sin(turn * t)], [np.sin(turn * t), np.cos(turn * t)]]
+        body, angle = rng.uniform(-0.5, 0.5, (80, 3)), rng.uniform(0, 2 * np.pi, 10)
+        body[np.arange(80), rng.integers(0, 3, 80)] = 0.5  # three faces
+        radius = 0.2 * np.sqrt(rng.uniform(size=10))
+        disk = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(10, 0.55)])
+        frames.append(np.float32(np.concatenate([body, disk])))
+        motions.append(motion)
+    cloud = CloudSequence.from_frames("cap", frames, part=[np.repeat([0, 1], [80, 10])] * 3)
+    steps = np.stack([np.stack([np.eye(4), motions[t + 1] @ np.linalg.inv(motions[t])]) for t in range(2)])
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, class_names=[], length_unit="m") as writer:
+        share, flow = np.eye(2, dtype=np.float32)[cloud.part], [np.zeros((90, 3), np.float32)] * 2
+        writer.write(cloud, share, np.array([(0, 1), (1, 2)]), steps, flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
+    assert json.loads((tmp_path / "j.json").read_text())[0]["joints"][0]["type"] == "fixed"
+    assert capsys.readouterr().err.count("called fixed") == said
 
 
 def test_one_frame_has_no_joints(tmp_path):
