@@ -43,7 +43,8 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
     """Returns a name for each file: its stem; where several share one, their folder's (`seed0/scores.h5`: seed0). May still repeat."""
     stems = [as_utf8(Path(path).stem) for path in paths]
     folders = [as_utf8(Path(path).resolve().parent.name) for path in paths]
-    return [folder or stem if stems.count(stem) > 1 else stem for stem, folder in zip(stems, folders)]
+    counts = Counter(stems)
+    return [folder or stem if counts[stem] > 1 else stem for stem, folder in zip(stems, folders)]
 
 
 def file_names(names: Sequence[str], otherwise: str = "object") -> list[str]:

@@ -66,10 +66,11 @@ def measure_by_class(
     >>> measure_by_class([2, 0, -1, 2], [10, 20, 30, 40], sum)
     {0: 20, 2: 50}
     """
-    return {
-        label: measure([row for own, row in zip(labels, rows, strict=True) if own == label])
-        for label in sorted({label for label in labels if label >= 0})
-    }
+    members: dict[int, list[Statistics]] = {}
+    for label, row in zip(labels, rows, strict=True):
+        if label >= 0:
+            members.setdefault(label, []).append(row)
+    return {label: measure(members[label]) for label in sorted(members)}
 
 
 def class_rows_json(rows: Mapping[int, dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:

@@ -73,13 +73,14 @@ class LabelMap:
         self._refuse_unknown(sources)
         renamed = [[self._new(path, name) for name in names] for path, names in sources]
         order = list(self.classes) or list(dict.fromkeys(new for names in renamed for new in names if new))
+        places = {name: place for place, name in enumerate(order)}
         for (path, names), new in zip(sources, renamed):
             for old, name in zip(names, new):
-                if name and name not in order:
+                if name and name not in places:
                     raise DataError(
                         f"{path}: class {old!r} becomes {name!r}, which classes of the label map doesn't list"
                     )
-        return order, [[order.index(name) if name else None for name in names] for names in renamed]
+        return order, [[places[name] if name else None for name in names] for names in renamed]
 
     def _new(self, path: Path, name: str) -> str:
         own = self.files.get(path.name, {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -82,7 +81,8 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     divided = len(deep) == len(parts)
     meant = len({parts[name][0] for name in deep}) > 1 or all(split_called(own[0]) for own in parts.values())
     if deep and meant and not divided:  # else `train` may be a class among others
-        misplaced = [repr(name) for name in parts if name not in set(deep)]
+        divides = set(deep)
+        misplaced = [repr(name) for name in parts if name not in divides]
         raise DataError(
             f"{root}: {first_names(misplaced)}: not SPLIT/{layout}, as {deep[0]!r} and"
             f" {len(deep)} in all are; move away what makes a sample of it, such as a stray picture"
@@ -95,7 +95,8 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     if not divided and all(len(own) > least for own in parts.values()):
         second = {name: split_called(own[1]) for name, own in parts.items()}
         splits = second if all(second.values()) and len({*second.values()}) > 1 else splits
-    rows = {name: Row(class_names.index(own), -1, splits[name]) for name, own in classes.items()}
+    places = {name: place for place, name in enumerate(class_names)}
+    rows = {name: Row(places[own], -1, splits[name]) for name, own in classes.items()}
     return LabelTable(root, rows, class_names)
 
 
@@ -141,10 +142,11 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
     else:
         class_names = sorted(set(words))
     _warn_of_classes(path, class_names, {int(word) for word in words} if all(map(_is_number, words)) else {0})
+    places = {name: place for place, name in enumerate(class_names)}
     rows, people = {}, _people(record.get("subject", "") for record in records.values())
     for name, record in records.items():
         where = f"{path}:{record['line']}"
-        label = int(record["label"]) if _is_number(record["label"]) else class_names.index(record["label"])
+        label = int(record["label"]) if _is_number(record["label"]) else places[record["label"]]
         if label < 0:
             raise DataError(f"{where}: label {label} is out of range; labels count from 0")
         subject = people.get(record.get("subject", ""), record.get("subject", "")) or "-1"
@@ -172,9 +174,11 @@ def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> No
     """
     if 0 not in labels:
         log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")
-    for alike, count in Counter(map(_folded, class_names)).items():
-        if count > 1:
-            names = [n if n == n.strip() else repr(n) for n in class_names if _folded(n) == alike]
+    spellings: dict[str, list[str]] = {}
+    for name in class_names:
+        spellings.setdefault(_folded(name), []).append(name if name == name.strip() else repr(name))
+    for names in spellings.values():
+        if len(names) > 1:
             log.warn(f"{path}: {' and '.join(names)} are different classes")
 
 

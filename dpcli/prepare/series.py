@@ -349,11 +349,11 @@ def choose_series(
     )
     for rule in rules:
         kept = rule(found)
-        left_out += [one for one in found if one not in kept]
+        left_out += _without(found, kept)
         found = kept
     if len(found) > 1 and judge is not None:
         kept = [one for one in found if judge(one.paths[0])] or found
-        left_out += [one for one in found if one not in kept]
+        left_out += _without(found, kept)
         found = kept
     if len(found) > 1:
         raise DataError(
@@ -427,17 +427,35 @@ def _preferred(
     none by ``judge``, such as pictures of depth beside arrays of it.
     """
     ranks = {suffix: rank for rank, suffix in enumerate(suffixes)}
-    twins = [one for one in found if any(_are_twins(one, other) for other in found)]
-    pictures = [one for one in twins if judge is not None and not judge(one.paths[0])]
-    kept: list[Series] = []
+    formats = _formats_of_stems(found)
+    pictures = {one for one in found if judge is not None and _is_twin(one, formats) and not judge(one.paths[0])}
+    dropped: list[Series] = []
+    taken: dict[str, set[str]] = {}
     for one in sorted(found, key=lambda one: (one in pictures, ranks.get(one.suffix, len(ranks)))):
-        if not any(_are_twins(one, other) for other in kept):
-            kept.append(one)
-    return [one for one in found if one in kept]
+        if _is_twin(one, taken):
+            dropped.append(one)
+            continue
+        for stem in one.stems:
+            taken.setdefault(stem, set()).add(one.suffix)
+    return _without(found, dropped)
 
 
-def _are_twins(one: Series, other: Series) -> bool:
-    return one.suffix != other.suffix and not one.stems.isdisjoint(other.stems)
+def _formats_of_stems(found: list[Series]) -> dict[str, set[str]]:
+    formats: dict[str, set[str]] = {}
+    for one in found:
+        for stem in one.stems:
+            formats.setdefault(stem, set()).add(one.suffix)
+    return formats
+
+
+def _is_twin(one: Series, formats: dict[str, set[str]]) -> bool:
+    """Returns whether a frame of a series is there in another format. formats: suffixes by the names without them."""
+    return any(formats.get(stem, set()) - {one.suffix} for stem in one.stems)
+
+
+def _without(found: list[Series], others: Sequence[Series]) -> list[Series]:
+    gone = set(others)  # a folder may hold thousands of series
+    return [one for one in found if one not in gone]
 
 
 def _no_texts(found: list[Series]) -> list[Series]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -68,7 +69,7 @@ class CloudsReader:
                 f"{self.path}: {counted(len(self.names), 'name')} for {counted(len(self._sequence_offsets) - 1, 'sequence')}"
             )
         if len(set(self.names)) != len(self.names):
-            twice = next(name for k, name in enumerate(self.names) if name in self.names[:k])
+            twice = Counter(self.names).most_common(1)[0][0]
             raise DataError(
                 f"{self.path}: the name {twice!r} occurs twice; names identify samples, make the file again"
             )

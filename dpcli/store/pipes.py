@@ -8,7 +8,7 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -104,14 +104,16 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
 
 def refuse_repeats(names: Iterable[str | Path]) -> None:
     """Raises UsageError where two of the names, inputs and the output, are of one file."""
-    seen: list[Path] = []
+    seen: set[Path | tuple[int, int]] = set()
     for name in names:
         path = Path(os.path.realpath(name))  # Path.resolve raises at a link in a circle, which opening names
-        if str(name) != "-" and any(
-            path == one or (path.exists() and one.exists() and path.samefile(one)) for one in seen
-        ):
+        own: set[Path | tuple[int, int]] = {path}
+        with suppress(OSError, ValueError):  # an output that isn't there yet
+            facts = path.stat()
+            own.add((facts.st_dev, facts.st_ino))
+        if str(name) != "-" and own & seen:
             raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
-        seen.append(path)
+        seen |= own
 
 
 def _is_result(path: Path) -> bool:

@@ -260,13 +260,17 @@ def _count(values: Iterable[Any]) -> dict[str, int]:
 def _who(class_names: list[str], labels: np.ndarray, splits: list[str]) -> dict[str, Any]:
     """Counts the samples of each class, in all and by split; of each split; and how many have no label."""
     names = list(class_names) or [""] * (int(labels.max(initial=-1)) + 1)
+    of_label: dict[int, list[str]] = {}
+    for split, label in zip(splits, labels.tolist(), strict=True):
+        of_label.setdefault(label, []).append(split)
     rows = []
     for label, name in enumerate(names):
-        own = [split for split, value in zip(splits, labels, strict=True) if value == label]
+        own = of_label.get(label, [])
         rows.append({"label": label, "name": name, "samples": len(own), "splits": _count(own)})
+    counts = Counter(splits)
     ordered = sorted(set(splits), key=lambda split: (_SPLITS.index(split) if split in _SPLITS else len(_SPLITS), split))
     return {
         "classes": rows,
         "unknown_labels": int((labels < 0).sum()),
-        "splits": {split: splits.count(split) for split in ordered},
+        "splits": {split: counts[split] for split in ordered},
     }

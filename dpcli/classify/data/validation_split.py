@@ -86,8 +86,10 @@ def people_of(rule: str) -> set[int]:
 
 def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int) -> tuple[list[int], list[int]]:
     held: set[int] = set()
-    for label in sorted({int(reader.labels[i]) for i in chosen}):
-        members = [i for i in chosen if reader.labels[i] == label]
+    of_label: dict[int, list[int]] = {}
+    for i in chosen:
+        of_label.setdefault(int(reader.labels[i]), []).append(i)
+    for label, members in sorted(of_label.items()):
         count = min(round(share * len(members)), len(members) - 1)
         held.update(
             int(members[k])
@@ -183,7 +185,8 @@ def about_absent_classes(reader: CloudsReader, training: list[int], validation: 
     """Returns which of the classes that were learned no validation video shows, for the user, "" where all are there or nothing
     is held out."""
     learned, judged = ({int(reader.labels[i]) for i in some} for some in (training, validation))
-    absent = [class_table(reader)[label] for label in sorted(learned - judged)]
+    names = class_table(reader)
+    absent = [names[label] for label in sorted(learned - judged)]
     if not judged or not absent:
         return ""
     return (
@@ -194,10 +197,12 @@ def about_absent_classes(reader: CloudsReader, training: list[int], validation: 
 
 def about_other_splits(reader: CloudsReader) -> str:
     """Returns which videos neither train nor judge, as they are of no split or of one that isn't known, "" where there are none."""
-    others = {name: None for name in reader.splits if name not in ("train", "validation", "test")}
+    others: dict[str, list[str]] = {}
+    for name, split in zip(reader.names, reader.splits):
+        if split not in ("train", "validation", "test"):
+            others.setdefault(split, []).append(name)
     told = []
-    for other in others:
-        names = [name for name, split in zip(reader.names, reader.splits) if split == other]
+    for other, names in others.items():
         whose = f"of the split {other!r}" if other else "of no split"
         told.append(f"{counted(len(names), 'video')} {whose} left out: {first_names(names)}")
     return "; ".join(told)

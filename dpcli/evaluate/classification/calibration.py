@@ -51,7 +51,8 @@ def calibrate(scores: np.ndarray, labels: np.ndarray) -> Calibration | None:
     confidence, right, bins = _best(scores, labels)
     samples = np.bincount(bins, minlength=BINS)
     sums = [np.bincount(bins, weights=values, minlength=BINS) for values in (confidence, right)]
-    answers = (generator(0).random((_DRAWS, len(bins))) < confidence).astype(np.float64)
+    rng = generator(0)
+    answers = ((rng.random(len(bins)) < confidence).astype(np.float64) for _ in range(_DRAWS))  # one draw in memory
     chance = np.stack([np.bincount(bins, weights=own - confidence, minlength=BINS) for own in answers])
     return Calibration(
         error=float(np.abs(sums[1] - sums[0]).sum() / len(bins)),

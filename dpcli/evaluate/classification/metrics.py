@@ -193,8 +193,8 @@ def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int =
     best = predicted_labels(scores)
     # samples of equal truth and prediction are alike: counts are summed over these cells, then over classes
     cells, order = np.unique(labels.astype(np.int64) * classes + best, return_inverse=True)
-    of_truth, of_prediction = np.eye(classes)[cells // classes], np.eye(classes)[cells % classes]
-    right = of_truth * of_prediction
+    of_truth, of_prediction = cells // classes, cells % classes
+    right = np.flatnonzero(of_truth == of_prediction)
     sort = np.argsort(order, kind="stable")
     starts = np.searchsorted(order[sort], np.arange(len(cells)))
     shares = {"accuracy": best == labels}
@@ -204,10 +204,21 @@ def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int =
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
         summed = np.add.reduceat(counts[:, sort], starts, axis=1)
-        support, predicted, hits = summed @ of_truth, summed @ of_prediction, summed @ right
+        support, predicted = (_class_sums(summed, of, classes) for of in (of_truth, of_prediction))
+        hits = np.zeros_like(support)
+        hits[:, of_truth[right]] = summed[:, right]
         return share_of_samples(counts) | {
             "balanced_accuracy": mean_defined_rows(class_recall(hits, support)),
             "macro_f1": mean_defined_rows(class_f1(hits, support, predicted)),
         }
 
     return metric
+
+
+def _class_sums(values: np.ndarray, labels: np.ndarray, classes: int) -> np.ndarray:
+    """Returns the sums of the columns of each class, f64 (R,classes), of values f64 (R,N) whose columns are of labels i64 (N)."""
+    order = np.argsort(labels, kind="stable")
+    present, starts = np.unique(labels[order], return_index=True)
+    sums = np.zeros((len(values), classes))
+    sums[:, present] = np.add.reduceat(values[:, order], starts, axis=1)
+    return sums

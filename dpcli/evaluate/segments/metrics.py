@@ -71,30 +71,36 @@ def _edit_score(ours: Sequence[Segment], theirs: Sequence[Segment]) -> float:
     """Returns 1 - Levenshtein distance of the two orders of classes / the longer one's length; NaN where both are empty."""
     if not ours and not theirs:
         return float("nan")
-    row = np.arange(len(theirs) + 1)
+    numbers = {name: number for number, name in enumerate({one.name for one in theirs})}
+    orders = np.array([numbers[one.name] for one in theirs], np.int64)
+    places = np.arange(len(theirs) + 1)
+    row = places
     for i, own in enumerate(ours, start=1):
-        above, row = row, np.empty_like(row)
-        row[0] = i
-        for j, other in enumerate(theirs, start=1):
-            row[j] = min(above[j] + 1, row[j - 1] + 1, above[j - 1] + (own.name != other.name))
+        reached = np.minimum(row[1:] + 1, row[:-1] + (orders != numbers.get(own.name, -1)))
+        row = np.minimum.accumulate(np.concatenate([[i], reached]) - places) + places  # then steps along the row
     return 1 - float(row[-1]) / max(len(ours), len(theirs))
 
 
 def _hits(ours: Sequence[Segment], theirs: Sequence[Segment], least: float) -> int:
     """Returns how many predicted segments are right: of their own class the true segment that they overlap most, by at least
     `least` of the union, and the first to claim it."""
-    taken: set[int] = set()
+    taken: set[tuple[str, int]] = set()
+    of_class: dict[str, list[tuple[int, int]]] = {}
+    for one in theirs:
+        of_class.setdefault(one.name, []).append((one.start, one.end))
+    ends = {name: np.array(rows) for name, rows in of_class.items()}
     for own in ours:
-        shares = [_overlap(own, other) if own.name == other.name else 0.0 for other in theirs]
-        best = int(np.argmax(shares)) if shares else 0
-        if shares and shares[best] >= least and best not in taken:
-            taken.add(best)
+        if own.name in ends:
+            shares = _overlaps(own, *ends[own.name].T)
+            best = int(shares.argmax())
+            if shares[best] >= least:
+                taken.add((own.name, best))
     return len(taken)
 
 
-def _overlap(one: Segment, other: Segment) -> float:
-    both = min(one.end, other.end) - max(one.start, other.start)
-    return max(both, 0) / (max(one.end, other.end) - min(one.start, other.start))
+def _overlaps(one: Segment, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    both = np.minimum(one.end, ends) - np.maximum(one.start, starts)
+    return np.maximum(both, 0) / (np.maximum(one.end, ends) - np.minimum(one.start, starts))
 
 
 def segments_weighted(counts: Sequence[RecordingCounts]) -> WeightedMetric:

@@ -256,8 +256,8 @@ def find_labels_of_clouds(arrays: Mapping[str, Any], source: Source) -> str:
 def _of_groups(arrays: Mapping[str, Any], source: Source, pattern: re.Pattern[str]) -> list[str]:
     """Returns the names of single numbers called alike, one in the group of each frame; [] without them."""
     groups = [key.rpartition("/")[0] for key in source.keys] if source.have_groups else []
-    first = {name.rpartition("/")[2] for name in arrays if groups and name.rpartition("/")[0] == groups[0]}
-    for own in sorted(filter(pattern.fullmatch, first)):
+    first = _called(arrays, groups[0], pattern) if groups else []
+    for own in sorted(name.rpartition("/")[2] for name in first):
         names = [f"{group}/{own}" for group in groups]
         if all(_is_single(arrays.get(name)) for name in names):
             return names
@@ -308,14 +308,21 @@ def _only_fitting(
     arrays: Mapping[str, Any], group: str, pattern: re.Pattern[str], shapes: Sequence[tuple[int, ...]]
 ) -> str:
     """Returns the only array of a group whose name and shape fit, "" where there is none or several."""
-    fitting = [
-        name
-        for name in arrays
-        if name.rpartition("/")[0] == group
-        and pattern.fullmatch(name.rpartition("/")[2])
-        and _plain(getattr(arrays[name], "shape", None)) in map(_plain, shapes)
-    ]
+    called = _called(arrays, group, pattern)
+    fitting = [name for name in called if _plain(getattr(arrays[name], "shape", None)) in map(_plain, shapes)]
     return fitting[0] if len(fitting) == 1 else ""
+
+
+def _called(arrays: Mapping[str, Any], group: str, pattern: re.Pattern[str]) -> list[str]:
+    """Returns the arrays of a group whose names fit; those of a file are searched once, see `ByName`."""
+    known = getattr(arrays, "fitting", {})
+    if pattern not in known:
+        groups = known[pattern] = {}
+        for name in arrays:
+            above, _, own = name.rpartition("/")
+            if pattern.fullmatch(own):
+                groups.setdefault(above, []).append(name)
+    return known[pattern].get(group, [])
 
 
 def find_beside(arrays: Mapping[str, Any], key: str, axes: str) -> Beside:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import pickle
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -27,8 +28,19 @@ _FEW = 1 << 20  # elements of a list of arrays
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
 PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
-_names: dict[tuple[Path, int, int], dict[str, str]] = {}  # arrays in the HDF5 file opened last, and where they lie
+_names: dict[tuple[Path, int, int], ByName[str]] = {}  # arrays in the HDF5 file opened last, and where they lie
+Content = TypeVar("Content")
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
+
+
+class ByName(dict[str, Content]):
+    """Holds something for each array of a file by name, and what was found out about the names: by the pattern that they fit, those
+    of each group. A file may hold thousands of sequences, and its names are searched once, not for each of them.
+    """
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.fitting: dict[re.Pattern[str], dict[str, list[str]]] = {}
 
 
 class Reversed:
@@ -266,20 +278,21 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             shown = {name: _shown(file, item, path) for name, item in items.items()}
             found = {name: array for name, array in shown.items() if array is not None}
             _names.clear()  # of the file before
-            _names[state] = {name: items[name].name for name in found}
+            _names[state] = ByName({name: items[name].name for name in found})
         else:
             found = {}
         names = _names[state]
-        yield _ByName(names, lambda name: _shown(file, file[names[name]], path), found)
+        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found)
 
 
-class _ByName(Mapping[str, Any]):
+class _Opened(Mapping[str, Any]):
     """Opens the arrays of a file whose names are known as they are asked for: sequences are read one by one from files with
     thousands of arrays.
     """
 
-    def __init__(self, names: Mapping[str, str], show: Callable[[str], Any], found: dict[str, Any]) -> None:
+    def __init__(self, names: ByName[str], show: Callable[[str], Any], found: dict[str, Any]) -> None:
         self._names, self._show, self._found = names, show, found
+        self.fitting = names.fitting
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._found:
@@ -405,18 +418,18 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
     if path.suffix.lower() == ".npy":
         return {"": _npy(path)}
     if path.suffix.lower() == ".mat":
-        return read_variables(path)
+        return ByName(read_variables(path))
     if path.suffix.lower() in (".h5", ".hdf5"):
         raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated")
     with reading(path), open_archive(path) as archive:
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
         arrays = {one.filename[: -len(".npy")]: _member(path, archive.read(one)) for one in members}
-    return {
-        name: array
+    return ByName(
+        (name, array)
         for name, array in arrays.items()
         if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names
-    }
+    )
 
 
 def _npy(path: Path) -> np.ndarray | list[np.ndarray]:

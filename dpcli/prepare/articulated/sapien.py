@@ -140,13 +140,13 @@ class Sapien:
         splits = self.split.assign([f.category for f in found], self.seed)
         problems, joints = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
         pad = min(self.articulation.max_parts, 1 + max(joints))
-        names = self.class_names
+        labels = {name: label for label, name in enumerate(self.class_names)}
         return [
             Item(
                 f"{f.name}_{number:03}" if not problem else f.name,
                 f.path,
                 split=split,
-                label=names.index(f.category) if f.category else -1,
+                label=labels[f.category] if f.category else -1,
                 extra={"parts": pad, "first": number == 0},
                 problem=problem,
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -169,7 +170,7 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
             "object will seem to. Cameras are read from transforms.json, with a time for each frame"
         )
     stems = [path.stem for path in paths]
-    twins = sorted({stem for stem in stems if stems.count(stem) > 1})
+    twins = sorted(stem for stem, count in Counter(stems).items() if count > 1)
     if twins:
         raise DataError(
             f"{folder}: {twins[0]!r} is there with two suffixes; choose with --pattern '*{paths[0].suffix}'"

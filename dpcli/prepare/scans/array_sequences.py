@@ -121,7 +121,8 @@ class ArraySequences(OwnScans):
             asked = f" whose names fit --pattern '{self.pattern}'" if self.pattern else ""
             raise DataError(f"{self.raw}: no files of arrays ({', '.join(SUFFIXES)}){asked}")
         if len(named) < len(kept):
-            twin = next(path for path in kept if path not in named.values())
+            shown = {*named.values()}
+            twin = next(path for path in kept if path not in shown)
             raise DataError(f"{twin}: there is a file of the same name in another format; keep one of them")
         return named
 
@@ -199,10 +200,11 @@ class ArraySequences(OwnScans):
     def _labels_inside(self) -> LabelTable | None:
         """Returns the labels that files hold beside each sequence, or beside many, whole numbers from 0; None without them."""
         rows: dict[str, Row] = {}
-        for path in self._paths.values():
-            own = [item for item in self._items if item.path == path and not item.problem]
-            if not own:
-                continue
+        good: dict[Path, list[Item]] = {}
+        for item in self._items:
+            if not item.problem:
+                good.setdefault(item.path, []).append(item)
+        for path, own in good.items():
             values = np.array([item.extra["label"] for item in own if item.extra["label"] is not None])
             if own[0].extra["source"].place is not None:
                 with open_arrays(path) as arrays:

@@ -112,18 +112,22 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: l
     The first one names those as left out, the poses that were found, and ``alone``: what lies in folders without clouds.
     """
     scans = [one for one in found if one.suffix not in TEXTS]
+    above_scans = {folder for one in scans for folder in one.folder.parents}
+    neighbors: dict[Path, list[Series]] = {}
+    for one in scans:
+        neighbors.setdefault(one.folder.parent, []).append(one)
 
     def is_log(one: Series) -> bool:
         if one.suffix not in TEXTS:
             if one.folder == root or not _OF_POINTS.fullmatch(one.folder.name):
                 return False
-            twins = [other for other in scans if other.folder.parent == one.folder.parent and other is not one]
+            twins = [other for other in neighbors[one.folder.parent] if other is not one]
             return any(one.stems == other.stems for other in twins)
-        above = len(one.names) == 1 and any(one.folder in other.folder.parents for other in scans)
+        above = len(one.names) == 1 and one.folder in above_scans
         return above or any(_ABOUT_SENSORS.fullmatch(part) for part in one.folder.relative_to(root).parts)
 
-    logs = [one for one in found if is_log(one)]
-    logs = [] if len(logs) == len(found) else logs
+    logs = {one: None for one in found if is_log(one)}
+    logs = {} if len(logs) == len(found) else logs
     first, *others = [one for one in found if one not in logs]
     named = sorted((one.folder / one.described()).relative_to(root).as_posix() for one in (*poses, *logs))
     return [replace(first, left_out=(*first.left_out, *named, *alone)), *others]

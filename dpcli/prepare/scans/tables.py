@@ -88,7 +88,8 @@ class TableSequences(OwnScans):
             raise DataError(f"{self.raw}: no tables ({', '.join((*TABLES, *SUFFIXES))})")
         named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in found}
         if len(named) < len(found):
-            twins = next(path for path in found if path not in named.values())
+            shown = {*named.values()}
+            twins = next(path for path in found if path not in shown)
             raise DataError(f"{twins}: there is a table of the same name in another format; keep one of them")
         return named
 
