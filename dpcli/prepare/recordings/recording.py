@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -207,7 +208,7 @@ def _declared(folder: Path) -> dict[str, tuple[str, int]]:
 def open_recording(path: Path) -> Iterator[Recording]:
     """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
     try:
-        import rosbags.typesys  # noqa: F401  # here, where its lack is not taken for damage
+        import_module("rosbags.typesys")  # here, where its lack is not taken for damage
     except ImportError:
         raise UsageError("recordings of robots need rosbags: pip install 'dpc-toolkit[recordings]'") from None
     if path.is_dir():  # metadata.yaml names files of the folder; they may be links
