@@ -8,6 +8,7 @@ from torch.nn.functional import embedding_bag
 
 from dpcli.generate4d.scene.motion import Motion
 from dpcli.ops.farthest_point_sampling import fps
+from dpcli.ops.gather import gather_points
 from dpcli.ops.nearest_neighbors import knn
 from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix
 
@@ -34,8 +35,10 @@ class ControlPoints(nn.Module):
 
     def weights(self, points: Tensor, nearest: Tensor) -> Tensor:  # [N, k]
         """Returns omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
-        squared = (points[:, None] - self.position[nearest]).square().sum(-1)
-        return (-squared / (2 * self.log_radius[nearest]).exp()).softmax(-1)
+        controls = torch.cat([self.position, self.log_radius[:, None]], -1)
+        near = gather_points(controls[None], nearest[None])[0]
+        squared = (points[:, None] - near[..., :3]).square().sum(-1)
+        return (-squared / (2 * near[..., 3]).exp()).softmax(-1)
 
     def carry(
         self,

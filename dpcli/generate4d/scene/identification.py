@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpcli.ops.gather import gather_points
 from dpcli.ops.nearest_neighbors import knn
 from dpcli.ops.rigid import rigid_flow, weighted_kabsch
 
@@ -36,7 +37,7 @@ def spatial_loss(
     >>> round(spatial_loss(parts, torch.tensor([[1], [0]])).item(), 4)
     1.4142
     """
-    difference = part[:, :, None] - part[:, neighbors]
+    difference = part[:, :, None] - gather_points(part, neighbors.expand(len(part), -1, -1))
     return (difference.square().sum(-1) + 1e-12).sqrt().mean()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpcli.ops.gather import gather_points
 from dpcli.ops.rotations import nearest_rotation
 
 
@@ -30,7 +31,7 @@ def arap_loss(
     The best rotation of each point is found without gradient. A row's own index, where neighbors lack, adds nothing.
     """
     before = (rest[neighbors] - rest[:, None]).detach()  # [N, H, 3]
-    after = moved[:, neighbors] - moved[:, :, None]  # [B, N, H, 3]
+    after = gather_points(moved, neighbors.expand(len(moved), -1, -1)) - moved[:, :, None]  # [B, N, H, 3]
     with torch.no_grad():
         covariance = torch.einsum("bnhi,nhj->bnij", after, before)
         rotation = nearest_rotation(covariance)
