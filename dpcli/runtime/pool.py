@@ -198,9 +198,8 @@ class _Pool:
         """Ends the processes; an executor of the caller's stays."""
         if self._given is None:
             try:
-                _submitted(
-                    self._executor, self._without, int
-                )  # the one public way to learn that processes died since the last item
+                # the one public way to learn that processes died since the last item
+                _submitted(self._executor, self._without, int)
             except BrokenProcessPool:
                 _end(set(multiprocessing.active_children()) - self._strangers)
             self._executor.shutdown(wait=True, cancel_futures=True)

@@ -23,11 +23,8 @@ _RESTING = 10.0  # times as little as in training that a column may vary: who mo
 _MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
 _OTHER_RATE = 1.5  # times as many frames a second
-_SHIPPED = {
-    "extent": 0.233,
-    "frames": 76.0,
-    "interval": 1 / 15,
-}  # MSR-Action3D's training videos: the shipped networks' files don't say it
+# of MSR-Action3D's training videos, which the shipped networks' files don't say
+_SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15}
 _ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
 _FINE = 1e-5  # of coordinates up to 100: what lies in one point there is not rounded to it

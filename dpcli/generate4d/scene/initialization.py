@@ -48,9 +48,7 @@ def first_points(
                 f"the object is too clear: no alpha of the frame to start from is above {clearest:.2f}, expected 0.5; take --set"
                 " start=sphere"
             )
-        pictures = [
-            targets.picture(view, frame) for view in shown
-        ]  # where it has left a picture, that one carves nothing
+        pictures = [targets.picture(view, frame) for view in shown]  # one that the object has left carves nothing
         cameras = targets.intrinsics[shown], targets.world_to_camera[shown]
         points, colors = carve_hull(pictures, *cameras, config.gaussians, rng)
     return torch.from_numpy(points), torch.from_numpy(colors)
