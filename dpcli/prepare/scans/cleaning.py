@@ -16,8 +16,8 @@ CROWDED = (
 )
 IMPOSSIBLE = "points at impossible places (such as 1e30 or -9999 on all axes) dropped"
 LONE = "frames whose only point lies at {}; if that stands for nothing seen, leave those rows out"
-_STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -32768.0, -(2.0**31), 2.0**31 - 1)
-# on all three axes
+# on all three axes; the greatest of 32 bits twice, as float32 rounds it up
+_STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -32768.0, -(2.0**31), 2.0**31 - 1, 2.0**31)
 _ROUNDED = 1e-8  # what remains of 0 where points were turned, or the smallest number of a type
 _SAMPLED, _SEVERAL = 2048, 8
 _JUMP, _OF_SIZE = 5, 0.25  # times the longest other step of any point; share of the widest frame

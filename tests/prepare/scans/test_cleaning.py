@@ -44,6 +44,7 @@ def convert_folder(folder, path, **options):
         ([-9999.0] * 3, IMPOSSIBLE),
         ([65535.0] * 3, IMPOSSIBLE),
         ([-(2.0**31)] * 3, IMPOSSIBLE),
+        ([np.float32(2**31 - 1)] * 3, IMPOSSIBLE),
         ([np.nan, 1, 1], NOT_FINITE),
         ([-np.inf, 1, 1], NOT_FINITE),
     ],
