@@ -107,7 +107,8 @@ def _densest(pixels: np.ndarray, reach: float) -> np.ndarray:
     fullest = np.bincount(cells).argmax()
     color = pixels[cells == fullest].mean(axis=0, dtype=np.float64)
     for _ in range(2):  # the cell may cut through the color's noise
-        color = pixels[np.abs(pixels - color).max(axis=1) <= reach].mean(axis=0, dtype=np.float64)
+        near = pixels[np.abs(pixels - color).max(axis=1) <= reach]
+        color = near.mean(axis=0, dtype=np.float64) if len(near) else color
     return color
 
 

@@ -209,6 +209,12 @@ def test_the_plain_background_is_found_beside_an_object_that_touches_the_border(
         matting.plain_background([matting.border_pixels(busy)], ["a"], matting.TOLERANCE)
 
 
+def test_a_noisy_background_without_any_tolerance_is_told():
+    noisy = np.random.default_rng(0).integers(120, 124, (40, 40, 1), np.uint8).repeat(3, axis=2)
+    with pytest.raises(DataError, match="not plain: 0% of the border is #7"):
+        matting.plain_background([matting.border_pixels(noisy)], ["frame"], 0.0)
+
+
 def test_one_crop_keeps_the_motion(tmp_path):
     folder = save(tmp_path / "clip", moving(4))
     clip = video_clip(folder, VideoOptions(size=50, border=0.2))
