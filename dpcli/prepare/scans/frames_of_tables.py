@@ -201,11 +201,11 @@ def _groups(table: Table, column: str, count: int) -> list[tuple[str, np.ndarray
         raise DataError(
             f"{table.path}: --sequence-column {column}: no such column; found {known}{_in_folders(table, column)}"
         )
-    words = np.array(table.words(table.names.index(column)))
-    order = dict.fromkeys(words.tolist())
-    if "" in order:
+    words, first, group = np.unique(table.words(table.names.index(column)), return_index=True, return_inverse=True)
+    if "" in words:
         raise DataError(f"{table.path}: a row has nothing in its column {column!r}; expected the name of its sequence")
-    return [(word.replace("/", "_"), np.flatnonzero(words == word)) for word in order]
+    rows = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    return [(str(words[place]).replace("/", "_"), rows[place]) for place in np.argsort(first)]
 
 
 def _cut(frames: np.ndarray, rows: np.ndarray, gap: float) -> list[np.ndarray]:
