@@ -168,7 +168,7 @@ def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray,
     Base color factor x vertex color x texture; alpha is 1 where the material is opaque, 0 or 1 where it is masked.
     """
     color = np.array([m.color for m in mesh.materials], np.float32)[material]
-    if mesh.color.min() < 1:
+    if (mesh.color != 1).any():
         color *= np.einsum("nk,nka->na", weights, mesh.color[corners])
     uv = None
     for index, entry in enumerate(mesh.materials):
