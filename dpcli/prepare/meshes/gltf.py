@@ -53,6 +53,8 @@ class Gltf:
     decoded: dict[int, np.ndarray] = field(default_factory=dict)
     blocks: dict[int, Any] = field(default_factory=dict)
     _buffers: dict[int, bytes] = field(default_factory=dict)
+    _unpacked: dict[int, tuple[bytes, int]] = field(default_factory=dict)  # views that many accessors share
+    _images: dict[int, np.ndarray] = field(default_factory=dict)  # which many materials share
 
     def fail(self, problem: str) -> DataError:
         """Returns the DataError that names the file and this fault."""
@@ -111,7 +113,7 @@ class Gltf:
 
     def view_bytes(self, index: Any) -> bytes:
         """Returns the bytes of a buffer view."""
-        return self._view(index)[0]
+        return bytes(self._view(index)[0])
 
     def _elements(self, view: Any, offset: int, count: int, columns: int, dtype: type, what: str) -> np.ndarray:
         data, stride = self._view(view)
@@ -142,14 +144,17 @@ class Gltf:
         )
         return values
 
-    def _view(self, index: Any) -> tuple[bytes, int]:
+    def _view(self, index: Any) -> tuple[bytes | memoryview, int]:
+        """Returns the bytes of a buffer view, and its stride, 0 where the file names none."""
         entry = self.item("bufferViews", index)
         packed = next((entry["extensions"][name] for name in MESHOPT if name in entry.get("extensions", {})), None)
-        if packed is not None:
-            return self._unpacked(index, packed)
-        return self._part(index, entry), entry.get("byteStride", 0)
+        if packed is None:
+            return self._part(index, entry), entry.get("byteStride", 0)
+        if index not in self._unpacked:
+            self._unpacked[index] = self._unpack(index, packed)
+        return self._unpacked[index]
 
-    def _unpacked(self, index: Any, packed: dict[str, Any]) -> tuple[bytes, int]:
+    def _unpack(self, index: Any, packed: dict[str, Any]) -> tuple[bytes, int]:
         """Returns the bytes of a buffer view that meshopt compressed, and its stride, 0 for indices."""
         count, size, mode = (packed.get(key) for key in ("count", "byteStride", "mode"))
         data = self._part(index, packed)
@@ -165,12 +170,12 @@ class Gltf:
                 "is compressed by meshopt: pip install 'dpc-toolkit[meshopt]' (Python 3.11 or later), or export it without"
             ) from None
         try:
-            rows = meshopt.decode_gltf_buffer(data, count, size, mode, packed.get("filter", "NONE"))
+            rows = meshopt.decode_gltf_buffer(bytes(data), count, size, mode, packed.get("filter", "NONE"))
         except (ValueError, RuntimeError, TypeError) as error:
             raise self.fail(f"bufferView {index}: meshopt cannot decode it ({error}); export the file again") from None
         return rows.tobytes(), size if mode == "ATTRIBUTES" else 0
 
-    def _part(self, index: Any, entry: dict[str, Any]) -> bytes:
+    def _part(self, index: Any, entry: dict[str, Any]) -> memoryview:
         """Returns the bytes of a buffer that a buffer view, or its compressed form, names."""
         data = self._buffer(entry.get("buffer"))
         start, length = entry.get("byteOffset", 0), entry.get("byteLength", 0)
@@ -179,7 +184,7 @@ class Gltf:
                 f"bufferView {index} needs bytes {start} to {start + length} of a buffer of {len(data)}; "
                 "the file is truncated or damaged"
             )
-        return data[start : start + length]
+        return memoryview(data)[start : start + length]
 
     def _buffer(self, index: Any) -> bytes:
         if index not in self._buffers:
@@ -240,11 +245,16 @@ class Gltf:
 
     def image(self, index: Any) -> np.ndarray:
         """Returns pixels of images[index], u8 (H,W,4), decoded by Pillow."""
+        entry = self.item("images", index)
+        if index not in self._images:
+            self._images[index] = self._decoded_image(index, entry)
+        return self._images[index]
+
+    def _decoded_image(self, index: int, entry: dict[str, Any]) -> np.ndarray:
         from PIL import Image, UnidentifiedImageError
 
-        entry = self.item("images", index)
         data = (
-            self._view(entry["bufferView"])[0] if "bufferView" in entry else self._resource(str(entry.get("uri", "")))
+            self.view_bytes(entry["bufferView"]) if "bufferView" in entry else self._resource(str(entry.get("uri", "")))
         )
         try:
             with Image.open(io.BytesIO(data)) as picture:

@@ -428,10 +428,9 @@ def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.nda
         amount = _morph_weights(file, piece, clip, time)
         positions = positions + np.einsum("tm,mva->tva", amount, piece.targets)
         normals = normals + np.einsum("tm,mva->tva", amount, piece.normal_targets)
-    bind = np.tile(np.eye(4), (poses.shape[1], 1, 1))
-    for bone, inverse in piece.inverse_bind.items():
-        bind[bone] = inverse
-    return skin(positions, normals, piece.bones, piece.weights, poses @ bind)
+    used, own = np.unique(piece.bones, return_inverse=True)  # of all nodes a piece hangs on few
+    bind = np.stack([piece.inverse_bind[bone] for bone in used.tolist()])
+    return skin(positions, normals, own.reshape(piece.bones.shape), piece.weights, poses[:, used] @ bind)
 
 
 def _morph_weights(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray) -> np.ndarray:

@@ -53,6 +53,16 @@ def test_packed_views_hold_what_went_in(tmp_path, name):
     np.testing.assert_array_equal(plain.positions, packed.positions)
 
 
+def test_a_view_that_accessors_share_is_unpacked_once(tmp_path, monkeypatch):
+    calls, decode = [], meshopt.decode_gltf_buffer
+    monkeypatch.setattr(meshopt, "decode_gltf_buffer", lambda *args: calls.append(1) or decode(*args))
+    file = compressed(arm())
+    primitives = file.tree["meshes"][0]["primitives"]
+    primitives.append(primitives[0])
+    loaded(file, tmp_path)
+    assert len(calls) == sum("extensions" in view for view in file.tree["bufferViews"])
+
+
 @pytest.mark.parametrize(
     "change, told",
     [

@@ -456,6 +456,23 @@ def test_vertex_colors_of_every_range(tmp_path, capsys, values, dtype, more, red
     assert ("are taken as shares of" in capsys.readouterr().err) is (max(values) > 8 and not more)
 
 
+def test_vertex_colors_above_1_make_brighter(tmp_path):
+    file = quad()
+    file.tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.1, 0.1, 0.1, 1]
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = file.add([[2.140411] * 3] * 4)
+    np.testing.assert_allclose(look(load(file, tmp_path))[32, 32, :3].astype(int), [128] * 3, atol=1)
+
+
+def test_a_picture_that_materials_share_is_decoded_once(tmp_path):
+    file = quad()
+    file.picture(np.array([[[255, 0, 0, 255], [0, 0, 255, 255]]], np.uint8))
+    file.tree["materials"].append({**file.tree["materials"][0], "emissiveFactor": [0.1, 0, 0]})
+    primitive = file.tree["meshes"][0]["primitives"][0]
+    file.tree["meshes"][0]["primitives"].append({**primitive, "material": 1})
+    first, second = load(file, tmp_path).materials
+    assert first.texture.pixels is second.texture.pixels
+
+
 @pytest.mark.parametrize("nearest, middle", [(True, [255, 0, 0]), (False, [188, 0, 188])])
 def test_pixels_of_a_texture_are_squares_where_the_file_says_so(tmp_path, nearest, middle):
     file = quad()
