@@ -27,7 +27,7 @@ _ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the cam
 _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that lie beside
     r"normals?|colou?rs?|rgb|flows?|feat(ure)?s?|seg\w*|masks?|intensit(y|ies)|reflect\w*|weights?|ids?", re.IGNORECASE
 )
-_LOOKED_AT = 20  # lines of a text that may hold poses
+_LOOKED_AT = 1000  # lines of a text that may hold poses: as many points have edges among them
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
@@ -203,6 +203,13 @@ def is_pose(path: Path) -> bool:
         return False
     values = np.array(rows)
     if values.shape[1] < 12:
-        return bool(np.allclose((values[:, -4:] ** 2).sum(1), 1, atol=1e-3) and np.ptp(values[:, -4:], 0).any())
+        return _are_quaternions(values[:, -4:])
     turns = values[:, :12].reshape(-1, 3, 4)[:, :, :3]
     return bool(np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-3))
+
+
+def _are_quaternions(values: np.ndarray) -> bool:
+    """Returns whether numbers (N,4) turn, not all alike; no normals of points with an intensity or a curvature of 0 beside."""
+    varying = np.ptp(values, axis=0) > 0
+    normals = varying.sum() == 3 and not values[:, ~varying].any() and not varying[[0, 3]].all()
+    return bool(np.allclose((values**2).sum(1), 1, atol=1e-3) and varying.any() and not normals)

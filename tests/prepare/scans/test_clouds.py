@@ -344,6 +344,18 @@ def test_the_way_of_a_camera_is_no_cloud(tmp_path, row):
     assert reader.summary(reader.items())[1] == "velodyne: its frames are 0.npy; left out: 00.txt"
 
 
+@pytest.mark.parametrize("edges", [False, True])
+def test_points_with_normals_and_curvature_or_intensity_are_no_poses(tmp_path, edges):
+    """Such as PCL's; where a surface is flat, a normal and its curvature are as long as a quaternion."""
+    normal = RNG.normal(size=(200, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    beside = np.zeros((200, 1)) if not edges else np.linspace(0, 0.2, 200)[:, None]
+    rows = [RNG.normal(size=(200, 3)), *((normal, beside) if edges else (beside, normal))]
+    np.savetxt(tmp_path / "0.txt", np.hstack(rows), fmt="%.6f")
+    (series,) = find_sequences(tmp_path, (".txt",))
+    assert series.names == ("0.txt",)
+
+
 def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
     for folder in ("a", "wave/b"):
         save(tmp_path / folder / "0.npy")
