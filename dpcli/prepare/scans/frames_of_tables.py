@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -142,7 +143,7 @@ def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | N
     else:
         values = moments
     _require_all(table, column, np.isfinite(values))
-    if moments is None and (told := calendar_seconds(column, values)) is not None:
+    if moments is None and (told := calendar_seconds(column, values, partial(table.words, place))) is not None:
         values = moments = told
     if moments is None and len(values) and np.abs(values).max() >= _EXACT:
         values = _exact(table.words(place), values)

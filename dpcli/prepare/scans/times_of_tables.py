@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -46,6 +47,7 @@ _CLOCK = re.compile(
     r"(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(?:([AP])\.?M\.?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
+_DIGITS = re.compile(r"(\d{14})(\d{3})?(?:\.(\d*))?")  # year to second, milliseconds, a fraction
 _DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # with points the day stands first
 _DAY = 86_400.0
 _TICK = 1e-7
@@ -112,23 +114,24 @@ def seconds_of(column: str, values: np.ndarray) -> float:
     return 0.0 if len(steps) and float(np.median(steps)) * unit > _LONGEST else unit
 
 
-def calendar_seconds(column: str, values: np.ndarray) -> np.ndarray | None:
+def calendar_seconds(column: str, values: np.ndarray, written: Callable[[], Sequence[str]]) -> np.ndarray | None:
     """Returns the seconds f64 (N) of a column of times whose numbers f64 (N) are written as digits of dates (20240305143057.25),
     as hours, minutes and seconds (143057.25), or as days (of spreadsheets, of MATLAB); None where they are nothing of these.
 
-    >>> calendar_seconds("utc", np.array([143059.5, 143100.0])) is None  # two frames are too few to tell
+    written: gives the numbers as they are written; of dates a float keeps steps of 4 milliseconds alone.
+
+    >>> calendar_seconds("utc", np.array([143059.5, 143100.0]), list) is None  # two frames are too few to tell
     True
-    >>> calendar_seconds("time", np.array([20240305143059.5, 20240305143100.0])).tolist()
-    [1709649059.5, 1709649060.0]
+    >>> dates = ["20240305143059.501", "20240305143100"]
+    >>> calendar_seconds("time", np.array(dates, float), lambda: dates).tolist()
+    [1709649059.501, 1709649060.0]
     """
     words = set(words_of(column))
     if not words & _TIME_WORDS or not words <= _NO_UNITS or not len(values) or not np.isfinite(values).all():
         return None
     least, most = float(values.min()), float(values.max())
-    if 1.9e13 < least <= most < 2.1e13:
-        return _of_digits(values)
-    if 1.9e16 < least <= most < 2.1e16:
-        return _of_digits(values / 1000)
+    if 1.9e13 < least <= most < 2.1e13 or 1.9e16 < least <= most < 2.1e16:
+        return _of_digits(written(), values)
     steps = np.diff(np.unique(values))
     step = float(np.median(steps)) if len(steps) else 0.0
     fractions = bool((values != np.floor(values)).any())
@@ -142,21 +145,27 @@ def calendar_seconds(column: str, values: np.ndarray) -> np.ndarray | None:
     return None
 
 
-def _of_digits(values: np.ndarray) -> np.ndarray | None:
-    """Returns the seconds since 1970, f64 (N), of numbers whose digits are year, month, day, hour, minute and second."""
-    days = {}
-    for day in np.unique(values // 1_000_000).astype(np.int64).tolist():
-        try:
-            moment = datetime(day // 10_000, day // 100 % 100, day % 100, tzinfo=timezone.utc)
-        except ValueError:
-            return None
-        days[day] = moment.timestamp()
-    clock = values % 1_000_000
+def _of_digits(words: Sequence[str], values: np.ndarray) -> np.ndarray | None:
+    """Returns the seconds since 1970, f64 (N), of numbers whose digits are year, month, day, hour, minute and second; by the
+    numbers' values f64 (N) where their words are no plain digits, such as 2.0240305143059500e+13.
+    """
+    found = [_DIGITS.fullmatch(word.strip()) for word in words]
+    if not all(found):
+        found = [_DIGITS.fullmatch(f"{value:.3f}") for value in values]
+    whole = np.array([match[1] for match in found], np.int64)
+    fraction = np.array([f"0.{match[2] or ''}{match[3] or ''}" for match in found], np.float64)
+    known, own = np.unique(whole // 1_000_000, return_inverse=True)
+    try:
+        days = [
+            datetime(day // 10_000, day // 100 % 100, day % 100, tzinfo=timezone.utc).timestamp()
+            for day in known.tolist()
+        ]
+    except ValueError:  # such as a month 13
+        return None
+    clock = whole % 1_000_000
     if not ((clock < 240_000) & (clock % 10_000 < 6000) & (clock % 100 < 60)).all():
         return None
-    known = np.array(list(days))
-    start = np.array(list(days.values()))[np.searchsorted(known, values // 1_000_000)]
-    return start + clock // 10_000 * 3600 + clock % 10_000 // 100 * 60 + clock % 100
+    return np.array(days)[own] + clock // 10_000 * 3600 + clock % 10_000 // 100 * 60 + clock % 100 + fraction
 
 
 def unit_by_rate(column: str, values: np.ndarray, fps: float) -> float:
@@ -213,7 +222,7 @@ def _one_column(table: Table, name: str) -> Clock | None:
         except DataError:
             seconds = np.array(clock_seconds(table.words(place)))
         else:
-            told = calendar_seconds(name, values)
+            told = calendar_seconds(name, values, partial(table.words, place))
             unit = seconds_of(name, values) if told is None and len(values) and np.isfinite(values).all() else 0.0
             seconds = told if told is not None else (values - values[0]) * unit if unit else values[:0]
     return Clock((name,), seconds) if len(seconds) and np.isfinite(seconds).all() else None

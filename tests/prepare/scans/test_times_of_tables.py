@@ -57,6 +57,7 @@ def csv(path, header, rows):
         ("timestamp", [315_966_265_259_836_000, 315_966_265_359_836_000], [0, 0.1]),  # nanoseconds
         ("timestamp", [20240305143059.5, 20240305143100.25], [0, 0.75]),
         ("timestamp", [20231231235959, 20240101000001], [0, 2]),
+        ("timestamp", ["2.0240305143059500e+13", "2.0240305143100000e+13"], [0, 0.5]),
         ("timestamp", [20249905143059.5, 20249905143100.25], [0, 40.75]),  # no date has a month 99
         ("time", ["1 day, 0:00:01", "2 days, 0:00:01"], [0, 86400]),
     ],
@@ -86,11 +87,11 @@ def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values,
     np.testing.assert_allclose(only_sequence(path, frame_column=name, fps=fps)[0].time, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("rate", [1, 4, 10, 25])
+@pytest.mark.parametrize("rate", [1, 4, 200])
 @pytest.mark.parametrize("written", ["spreadsheet", "matlab", "clock", "digits", "milliseconds"])
 @pytest.mark.parametrize("as_frames", [False, True])
 def test_moments_written_as_days_or_as_digits_are_seconds(tmp_path, rate, written, as_frames):
-    moments = [datetime(2024, 3, 5, 14, 59, 50) + timedelta(seconds=k / rate) for k in range(20 * rate)]
+    moments = [datetime(2024, 3, 5, 14, 59, 50) + timedelta(seconds=k / rate) for k in range(12 * rate)]
     days = [(moment - datetime(1899, 12, 30)) / timedelta(days=1) for moment in moments]
     values = {
         "spreadsheet": [f"{day:.11f}" for day in days],
@@ -101,7 +102,7 @@ def test_moments_written_as_days_or_as_digits_are_seconds(tmp_path, rate, writte
     }[written]
     path = csv(tmp_path / "a.csv", "frame,utc,x,y,z", [(k, value, k, 1, 2) for k, value in enumerate(values)])
     sequence, _ = only_sequence(path, frame_column="utc" if as_frames else "frame")
-    np.testing.assert_allclose(sequence.time, np.arange(len(values)) / rate, atol=5e-3)
+    np.testing.assert_allclose(sequence.time, np.arange(len(values)) / rate, atol=2e-5)
 
 
 def test_plain_seconds_stay_seconds(tmp_path):
