@@ -172,7 +172,8 @@ class SemanticKitti:
         notes[_REMAPPED] = sum(strange for _, _, _, strange in kept)
         motions = self._alignment(item)
         moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _, _), m in zip(kept, motions, strict=True)]
-        clouds = [orient_points(to_camera_axes(points) if whole else points, self.coordinates) for points in moved]
+        ahead = whole and to_camera[2, 0] < 0.5  # x of the scanner stays x, as by a Tr that moves nothing
+        clouds = [orient_points(to_camera_axes(points) if ahead else points, self.coordinates) for points in moved]
         sizes = np.cumsum([len(ids) for _, ids, _, _ in kept])[:-1]
         # over all frames: an object keeps its number
         part = renumber_objects(np.concatenate([ids for _, ids, _, _ in kept]))

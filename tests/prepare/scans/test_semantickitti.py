@@ -127,6 +127,19 @@ def test_other_files_of_the_same_names_are_other_data(tmp_path, change):
         convert(SemanticKitti(raw), out)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_scans_of_ones_own_without_a_camera_are_kept_whole(tmp_path, turned):
+    points = np.concatenate([visible(5), [[0, 0, -5.0], [50, 0, 20.0]]])
+    folder = write_scans(sequences(tmp_path) / "00", {"000000": points}, {"000000": LABELS})
+    to_camera = velodyne_to_camera() if turned else np.eye(4)
+    write_calibration(folder / "calib.txt", P2=np.eye(4)[:3], Tr=to_camera[:3])
+    sample = SemanticKitti(tmp_path).read(SemanticKitti(tmp_path).items()[0], None)
+    assert sum("scans kept whole" in note for note in sample.notes) == 1
+    scan = np.fromfile(folder / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)[:, :3]
+    expected = points * [-1, -1, 1] if turned else scan[:, [1, 2, 0]]  # x left, y up, z forward
+    np.testing.assert_allclose(sample.sequence.points, expected, atol=1e-4)
+
+
 def test_command_windows_and_skipped(tmp_path):
     raw = tmp_path / "semantisches kitti"
     scans = {f"{n:06d}": visible(6, n) for n in range(7)}
