@@ -13,7 +13,7 @@ from pathlib import Path
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
-from dpcli.prepare.decode.color_frames import Frames, open_frames
+from dpcli.prepare.decode.color_frames import Frames, image_size, open_frames
 from dpcli.prepare.reader import Item, require_folder
 from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_config
@@ -126,21 +126,13 @@ class ClipIndex:
 
 
 def _frame_items(frames: Frames) -> Iterator[Item]:
-    first: tuple[str, tuple[int, int]] | None = None
+    first: tuple[str, str] | None = None
     for name, path in zip(frames.names, frames.files, strict=True):
-        size, problem = _picture_size(path)
-        if size and first and size != first[1]:
-            problem = f"{size[0]}x{size[1]}, {first[0]} is {first[1][0]}x{first[1][1]}; export all frames at one size"
-        first = first or ((name, size) if size else None)
-        yield Item(name, path, problem=problem)
-
-
-def _picture_size(path: Path) -> tuple[tuple[int, int] | None, str]:
-    """Returns ((width, height), "") of a picture, or (None, what is wrong)."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.size, ""
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None, "not a readable image; export this frame again"
+        try:
+            size = "{}x{}".format(*image_size(path))
+        except DataError:
+            yield Item(name, path, problem="not a readable image; export this frame again")
+            continue
+        first = first or (name, size)
+        same = size == first[1]
+        yield Item(name, path, problem="" if same else f"{size}, {first[0]} is {first[1]}; export all frames at one size")

@@ -23,6 +23,7 @@ from dpcli.prepare.views.orbit_world import up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
+from dpcli.prepare.views.views_check import ClipIndex
 from dpcli.runtime.clips.video_frames import frame_times, lasts
 from dpcli.store import ViewsReader
 from tests.support.commands import exit_code
@@ -375,7 +376,9 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, mon
     turned[0x0112] = 6
     Image.fromarray(np.rot90(moving(1)[0])).save(folder / "1.png", exif=turned)
     assert video_clip(folder, SMALL).header is not None
+    assert [item.problem for item in ClipIndex(folder, SMALL).items()] == [""] * 3
     Image.new("RGBA", (4000, 4000)).save(folder / "2.png")
+    assert "4000x4000, 0.png is 64x48" in ClipIndex(folder, SMALL).items()[2].problem
     monkeypatch.setattr("dpcli.prepare.decode.color_frames.read_rgba", None)
     with pytest.raises(DataError, match="2.png is 4000x4000, 0.png is 64x48"):
         video_clip(folder, SMALL)
