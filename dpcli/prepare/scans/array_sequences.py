@@ -93,7 +93,7 @@ class ArraySequences(OwnScans):
     pattern: str = ""
 
     def __post_init__(self) -> None:
-        self.check_options()
+        super().__post_init__()
         object.__setattr__(self, "axes", check_axes(self.axes))
 
     @property
@@ -241,7 +241,7 @@ class ArraySequences(OwnScans):
             beside, axes = self._beside(item.path, arrays, source)
             frames = _frames(item.path, arrays, source, axes)
             colors = _cut(arrays[beside.colors], axes, source.place) if beside.colors else None
-            kept = {
+            columns = {
                 name: self._column(item.path, arrays, name, source, axes) for name in with_track(self.keep, self.track)
             }
             time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
@@ -261,22 +261,18 @@ class ArraySequences(OwnScans):
                 frame,
                 None if colors is None else colors[t],
                 unit,
-                extra={name: values[t] for name, values in kept.items()},
+                extra={name: values[t] for name, values in columns.items()},
             )
             for t, frame in enumerate(frames)
         ]
         identify(item.path, clouds, self.track, self.keep)
-        dropped = sum(int(np.count_nonzero(~own)) for own in real[:wanted])
+        more, kept = len(clouds) - wanted, slice(0, wanted, self.stride)
+        clouds, real = clouds[kept], real[kept]
+        dropped = sum(int(np.count_nonzero(~own)) for own in real)
         for cloud, own in zip(clouds, real):
             cloud.keep(own)
-        more, clouds = len(clouds) - wanted, clouds[: wanted : self.stride]
-        sample = assemble(
-            item,
-            clouds,
-            Lengths(self.scale, self.unit),
-            color=item.extra["color"],
-            time=None if time is None else time[: wanted : self.stride],
-        )
+        time = None if time is None else time[kept]
+        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= {MORE_FRAMES: more} if more else {}
         sample.notes |= {UNCOUNTED: dropped} if dropped else {}
         return sample

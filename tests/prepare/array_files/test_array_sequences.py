@@ -12,7 +12,7 @@ import scipy.io
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.array_files.axes import axes_of, check_axes
-from dpcli.prepare.scans.array_sequences import MORE_FRAMES, ArraySequences
+from dpcli.prepare.scans.array_sequences import MORE_FRAMES, UNCOUNTED, ArraySequences
 from dpcli.store import CloudsReader
 from tests.support.commands import exit_code
 
@@ -108,6 +108,9 @@ def test_counts_masks_and_times_beside_the_clouds(tmp_path, form):
         assert np.allclose(reader.read(0).time, times - times[0])
     found = read(write(tmp_path / "mask", form, points=clouds, mask=mask.astype(np.uint8)))["mask"]
     assert same(found, [frame[own] for frame, own in zip(clouds, mask)])
+    reader = ArraySequences(tmp_path / f"mask.{form}", stride=2)
+    notes = reader.read(reader.items()[0], np.random.default_rng(0)).notes
+    assert notes == {UNCOUNTED: np.count_nonzero(~mask[::2])}
 
 
 @pytest.mark.parametrize("told", ["mm", b"millimeters", np.array([b"mm"])])
