@@ -15,13 +15,13 @@ from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
 from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, hidden_points, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
+from dpcli.prepare.views.orbit_world import OBJECT_RADIUS
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
 from dpcli.store.views import ViewsHeader
 
-OBJECT_RADIUS = 0.75  # of the ball around the object; the default camera sees 0.83 whole
 _CHUNK = 4  # frames that a worker gets at a time: the mesh travels with them
 _STILL = 1e-3  # of the object's radius: what moves less than this is no motion
 

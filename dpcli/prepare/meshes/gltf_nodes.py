@@ -162,15 +162,15 @@ def _read_curve(file: Gltf, what: str, path: str, times: int, values: int, inter
     if (np.diff(times) < 0).any():
         raise file.fail(f"{what}: its times do not rise; export the file again")
     values = file.accessor(values, what).astype(np.float64)
-    groups = (3,) if interpolation == "CUBICSPLINE" else ()
-    width = len(_REST[path]) if path in _REST else values.size // (len(times) * (groups[0] if groups else 1))
-    if values.size != len(times) * max(1, *groups, 1) * width or not width:
+    group = (3,) if interpolation == "CUBICSPLINE" else ()  # a key has tangents before and behind its value
+    count = len(times) * (3 if group else 1)
+    width = len(_REST[path]) if path in _REST else values.size // count
+    if values.size != count * width or not width:
         raise file.fail(f"{what}: {values.size} numbers for {len(times)} keys of {width}; export the file again")
-    values = values.reshape(len(times), *groups, width)
-    quaternions = values[:, 1] if groups else values
-    if path == "rotation" and (np.linalg.norm(quaternions, axis=-1) < 1e-6).any():
-        key = int(np.argmax(np.linalg.norm(quaternions, axis=-1) < 1e-6))
-        raise file.fail(f"{what}: the quaternion of key {key} is zero; repair the model, export it again")
+    values = values.reshape(len(times), *group, width)
+    short = np.linalg.norm(values[:, 1] if group else values, axis=-1) < 1e-6
+    if path == "rotation" and short.any():
+        raise file.fail(f"{what}: the quaternion of key {short.argmax()} is zero; repair the model, export it again")
     return Curve(times, values, interpolation, path == "rotation")
 
 

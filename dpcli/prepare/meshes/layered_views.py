@@ -19,8 +19,8 @@ from dpcli.prepare.bounding_sphere import bounding_sphere
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf_material import to_srgb
 from dpcli.prepare.meshes.raycast import emitted, light_on, surface_color
+from dpcli.prepare.views.orbit_world import OBJECT_RADIUS
 
-_RADIUS = 0.75  # of the ball around the object, as `filming` has it
 _LEAST_GAP = 0.01  # of the picture's side: what lies closer is one body
 _LEAST_SHOWN = 0.02  # of the pixels of a picture
 _WAVES = 3  # random waves of a warp
@@ -64,7 +64,7 @@ def posed(mesh: AnimatedMesh, rng: np.random.Generator) -> PosedMesh | None:
         shading = float(rng.uniform(0.2, 0.8))
         if not radius > 0:
             continue
-        moved = (_RADIUS / radius) * (mesh.positions[frame] - center)
+        moved = (OBJECT_RADIUS / radius) * (mesh.positions[frame] - center)
         lit = plain * light_on(mesh, triangle, mesh.normals[frame][corners], shading)[:, None] + shine
         vertices.append(moved.astype(np.float32))
         colors.append(np.rint(255 * to_srgb(np.clip(lit, 0, 1))).astype(np.uint8).reshape(-1, 3, 3))
@@ -174,7 +174,7 @@ def _triangles(
 def _cameras(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draws poses (N,3,4), world to camera, OpenCV axes, and distances (N)."""
     elevation = np.radians(np.clip(rng.normal(5, 12, count), -10, 40))
-    distance = _RADIUS / np.sin(np.radians(rng.uniform(10, 30, count)))
+    distance = OBJECT_RADIUS / np.sin(np.radians(rng.uniform(10, 30, count)))
     azimuth = rng.uniform(0, 2 * np.pi, count)
     return np.stack([orbit_pose(*one)[:3] for one in zip(azimuth, elevation, distance)]), distance
 

@@ -90,7 +90,12 @@ class OwnScans:
     track: str = ""
 
     def __post_init__(self) -> None:
-        self.check_options()
+        """Raises UsageError for options that exclude each other, or a scale or a rate that is no positive number."""
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+        Lengths(self.scale, self.unit)
 
     @cached_property
     def _table(self) -> LabelTable | None:
@@ -100,14 +105,6 @@ class OwnScans:
         """Returns the optional fields that every sample has, given whether all have times, and colors."""
         told = {"time": time, "color": color, "track": self.track}
         return (*(name for name, known in told.items() if known), *kept_names(self.keep))
-
-    def check_options(self) -> None:
-        """Raises UsageError for options that exclude each other, or a scale or a rate that is no positive number."""
-        if self.labels and self.label_from_folder:
-            raise UsageError("--labels and --label-from-folder were both given; use one")
-        if self.fps is not None and not self.fps > 0:
-            raise UsageError("--scale and --fps must be more than 0")
-        Lengths(self.scale, self.unit)
 
     @property
     def class_names(self) -> list[str]:

@@ -36,14 +36,14 @@ class CloudFolders(OwnScans):
     pattern: str = ""
 
     def __post_init__(self) -> None:
-        self.check_options()
+        super().__post_init__()
         if self.bin_columns is not None and self.bin_columns < 3:
             raise UsageError(f"--bin-columns {self.bin_columns}: expected 3 (x y z) or more")
 
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
-        return self.fields_beside(time=self._timed, color=self._has_color)
+        return self.fields_beside(time=self._timed, color=self._first[0])
 
     @property
     def config(self) -> dict[str, Any]:
@@ -75,10 +75,6 @@ class CloudFolders(OwnScans):
         """Returns whether the time of every frame is known: by ``fps``, or because all names are times."""
         return all(one.frame_times(self.fps) is not None for one in self._series)
 
-    @property
-    def _has_color(self) -> bool:
-        return self._first[0]
-
     @cached_property
     def _first(self) -> tuple[bool, tuple[str, ...]]:
         """Returns whether the first good cloud has colors, and which of its columns are not read."""
@@ -95,7 +91,8 @@ class CloudFolders(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        items, told = [], {"color": self._has_color, "timed": self._timed, "unread": self._first[1]}
+        color, unread = self._first
+        items, told = [], {"color": color, "timed": self._timed, "unread": unread}
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, series.folder, extra={**told, "series": series}))

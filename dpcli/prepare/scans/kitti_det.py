@@ -33,6 +33,8 @@ TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram
 MARGIN = 0.01  # meters by which a box is larger than its label says
 SCANS = 7481
 _SPLITS = {"train": "train", "val": "validation"}
+_FILES = {"calib": ".txt", "label_2": ".txt"}
+_OTHERS = {"velodyne": ".bin", "image_2": ".png"}
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,3 @@ class KittiDetection:
         if len(items) != SCANS:
             lines.append(f"{counted(len(items), 'scan')} where the published training set has {SCANS}")
         return lines
-
-
-_FILES = {"calib": ".txt", "label_2": ".txt"}
-_OTHERS = {"velodyne": ".bin", "image_2": ".png"}

@@ -65,23 +65,22 @@ _FILE = re.compile(r"ply_data_(train|test)(\d+)\.h5")
 _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and test_files.txt"
 
 
-def read_file(path: Path, *names: str) -> list[np.ndarray]:
-    """Reads data sets of an HDF5 file as arrays. Raises DataError when absent, damaged, or kept in another file."""
+def _read_array(path: Path, name: str) -> np.ndarray:
+    """Reads a data set of an HDF5 file. Raises DataError when absent, damaged, or kept in another file."""
     check_heaps(path)
     with reading(path), h5py.File(path, "r") as file:
-        for name in names:
-            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                found = ", ".join(sorted(file)) or "none"
-                raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
-            if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
-                raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
-            refuse_claim(file[name], path)
-        return [file[name][()] for name in names]
+        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+            found = ", ".join(sorted(file)) or "none"
+            raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
+        if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
+            raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
+        refuse_claim(file[name], path)
+        return file[name][()]
 
 
 @lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
 def _clouds(path: Path) -> np.ndarray:
-    (data,) = read_file(path, "data")
+    data = _read_array(path, "data")
     if data.ndim != 3 or data.shape[2] != 3 or data.dtype.kind != "f":
         raise DataError(f"{path}: data is {data.dtype} {data.shape}; expected floats (shapes, points, 3)")
     return data
@@ -89,7 +88,7 @@ def _clouds(path: Path) -> np.ndarray:
 
 def read_labels(path: Path) -> np.ndarray:
     """Returns labels i64 (N) of a file, from 0."""
-    (label,) = read_file(path, "label")
+    label = _read_array(path, "label")
     if label.dtype.kind not in "iu" or label.ndim == 0 or label.size != len(label):
         raise DataError(f"{path}: label is {label.dtype} {label.shape}; expected whole numbers (shapes, 1)")
     return label.reshape(-1).astype(np.int64)

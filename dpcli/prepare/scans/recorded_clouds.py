@@ -33,7 +33,7 @@ class RecordedClouds(OwnScans):
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has: time, color when the very first cloud has it, what is kept."""
-        return self.fields_beside(time=True, color=self._has_color)
+        return self.fields_beside(time=True, color=self._first[0])
 
     @cached_property
     def _names(self) -> dict[str, Path]:
@@ -57,10 +57,6 @@ class RecordedClouds(OwnScans):
     def _read(self) -> tuple[str, ...]:
         return with_track(self.keep, self.track)
 
-    @property
-    def _has_color(self) -> bool:
-        return self._first[0]
-
     @cached_property
     def _first(self) -> tuple[bool, tuple[str, ...]]:
         """Returns whether the first good cloud that saw something has colors, and which of its fields are not read."""
@@ -78,8 +74,8 @@ class RecordedClouds(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when there is no recording."""
-        told = {"color": self._has_color, "unread": self._first[1]}
-        items = [Item(name, path, extra=told) for name, path in self._names.items()]
+        color, unread = self._first
+        items = [Item(name, path, extra={"color": color, "unread": unread}) for name, path in self._names.items()]
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

@@ -60,7 +60,7 @@ class TableSequences(OwnScans):
     gap: float | None = None
 
     def __post_init__(self) -> None:
-        self.check_options()
+        super().__post_init__()
         if self.gap is not None and not self.gap > 0:
             raise UsageError(f"--gap {self.gap:g}: expected more than 0, in the numbers of the frame column")
 

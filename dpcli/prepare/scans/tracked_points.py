@@ -126,7 +126,7 @@ class TrackedViews(OwnScans):
     """
 
     def __post_init__(self) -> None:
-        self.check_options()
+        super().__post_init__()
         if self.keep or self.label_from_folder or self.track not in ("", ROWS):
             raise UsageError(
                 f"{self.raw}: holds views and their true tracks; leave out --keep-fields, --label-from-folder, --track"

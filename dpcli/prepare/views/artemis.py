@@ -83,10 +83,9 @@ def artemis_config(animal: Path, options: ArtemisOptions) -> dict[str, Any]:
     motion = find_motion(animal, options.motion)
     small = [animal / "CamPose.inf", animal / "Intrinsic.inf"]
     small += sorted((animal / "bones" / options.motion).glob("Bones_*.inf"))
-    names = "\n".join(f"{frame}" for frame in motion.folders)
     return {
         **asdict(options),
-        "frames_found": names.count("\n") + 1,
+        "frames_found": len(motion.folders),
         "input_digest": digest_of(p for p in small if p.is_file()),
     }
 

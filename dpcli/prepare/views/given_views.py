@@ -119,9 +119,7 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
 
 
 def _matching(where: Path, have: list[int], numbers: Sequence[int], total: int) -> list[int]:
-    """Returns positions of the frames `numbers` among `have`: by number, or in order where both sides count all `total`
-    frames.
-    """
+    """Returns the positions of the frames `numbers`, out of `total` of the clip, among the numbers `have` of some pictures."""
     place = {number: row for row, number in enumerate(have)}
     missing = [number for number in numbers if number not in place]
     if not missing:

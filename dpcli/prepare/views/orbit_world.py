@@ -11,7 +11,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 
-OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits the default camera's picture
+OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: the default camera sees 0.83 whole
 _NEAREST = 1e-6  # of the scene's size: what is nearer lies in a camera
 _SAME, _TURNED = 1e-3, 0.1  # of the scene's size: cameras in one place; and radians: what they are turned by there
 _PARALLEL = 0.01  # how much shorter than 1 the mean of rays is that go one way

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -108,7 +107,7 @@ def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:
 def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int]]:
     """Returns the box of the object over all times, and the (width, height) of a view."""
     boxes: list[Box] = []
-    sizes: dict[tuple[int, int], Path] = defaultdict()
+    sizes: dict[tuple[int, int], Path] = {}
     for time in times:
         rgba = _cut(view, time, options)
         sizes.setdefault((rgba.shape[1], rgba.shape[0]), view.paths[time])

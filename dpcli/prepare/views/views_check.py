@@ -135,4 +135,6 @@ def _frame_items(frames: Frames) -> Iterator[Item]:
             continue
         first = first or (name, size)
         same = size == first[1]
-        yield Item(name, path, problem="" if same else f"{size}, {first[0]} is {first[1]}; export all frames at one size")
+        yield Item(
+            name, path, problem="" if same else f"{size}, {first[0]} is {first[1]}; export all frames at one size"
+        )
