@@ -106,9 +106,10 @@ def test_counts_masks_and_times_beside_the_clouds(tmp_path, form):
     assert same(found, [frame[:count] for frame, count in zip(clouds, counts)])
     with CloudsReader(tmp_path / "counts-0.converted") as reader:
         assert np.allclose(reader.read(0).time, times - times[0])
-    found = read(write(tmp_path / "mask", form, points=clouds, mask=mask.astype(np.uint8)))["mask"]
+    path = write(tmp_path / "mask", form, points=clouds, mask=mask.astype(np.uint8))
+    found = read(path)["mask"]
     assert same(found, [frame[own] for frame, own in zip(clouds, mask)])
-    reader = ArraySequences(tmp_path / f"mask.{form}", stride=2)
+    reader = ArraySequences(path, stride=2)
     notes = reader.read(reader.items()[0], np.random.default_rng(0)).notes
     assert notes == {UNCOUNTED: np.count_nonzero(~mask[::2])}
 
