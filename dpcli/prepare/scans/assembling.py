@@ -200,8 +200,10 @@ def _lost_neighbors(one: Cloud, other: Cloud) -> float:
     step = max(1, len(here) // _LOOKED_AT)
     before, kept = np.unique(one.points[here[::step]].astype(np.float64), axis=0, return_index=True)
     after = other.points[there[::step][kept]].astype(np.float64)
+    if len(before) < _MANY:
+        return 0.0
     sizes = [np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()) for points in (before, after)]
-    if len(before) < _MANY or not min(sizes) > 0:
+    if not min(sizes) > 0:
         return 0.0
     distance, neighbor = (found[:, 1] for found in cKDTree(before).query(before, k=2))
     apart = np.linalg.norm(after - after[neighbor], axis=1)
