@@ -139,7 +139,7 @@ def test_scene_flow_command_thins_each_frame_and_keeps_flow(tmp_path):
     scenes = {f"{n:06d}": make_scene(n) for n in (3, 100)}
     raw = write_scenes(tmp_path / "KITTI Szenenfluß", scenes)
     (raw / "training" / "instance" / "000100_10.png").unlink()
-    done = dpc("prepare", "kitti-sf", raw, "-o", tmp_path / "x.h5", "--points", 9, "--jobs", 1)
+    done = dpc("prepare", "kitti-sf", raw, "-o", tmp_path / "x.h5", "--points", 9, "--jobs", 1, "--item-seconds", 0)
     assert done.returncode == 0, done.stderr
     assert "2 scenes where the published training set has 200" in done.stderr
     full = KittiSceneFlow(raw)
@@ -384,7 +384,7 @@ def test_detection_command_lists_and_notes(tmp_path):
     (raw / "ImageSets").mkdir()
     (raw / "ImageSets" / "train.txt").write_text("000000\n000009\n")
     (raw / "ImageSets" / "val.txt").write_text("000003\n000005\n")
-    done = dpc("prepare", "kitti-det", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    done = dpc("prepare", "kitti-det", raw, "-o", tmp_path / "x.h5", "--jobs", 1, "--item-seconds", 0)
     assert done.returncode == 0, done.stderr
     assert "cropped to 1242x375, their image_2 is missing: 1" in done.stderr
     assert "000009.bin: listed (train), but not there" in done.stderr

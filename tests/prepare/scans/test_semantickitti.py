@@ -146,9 +146,8 @@ def test_command_windows_and_skipped(tmp_path):
     labels = {name: [label(CAR, 1 + n % 2)] * 3 + [ROAD] * 3 for n, name in enumerate(scans)}
     folder = write_scans(sequences(raw) / "08", scans, labels)
     (folder / "labels" / "000004.label").unlink()
-    done = dpc(
-        "prepare", "semantickitti", raw, "--group", "only-08", "--frames", 2, "-o", tmp_path / "x.h5", "--jobs", 1
-    )
+    options = ("--group", "only-08", "--frames", 2, "--jobs", 1, "--item-seconds", 0)
+    done = dpc("prepare", "semantickitti", raw, *options, "-o", tmp_path / "x.h5")
     assert done.returncode == 0, done.stderr
     assert "1 scan at the ends of sequences left out: fewer than --frames 2" in done.stderr
     with CloudsReader(tmp_path / "x.h5") as reader:
