@@ -187,7 +187,7 @@ class KittiDetection:
         part = parts_of_boxes(points, boxes)
         notes = {
             OUTSIDE: len(scan) - len(points),
-            "scans cropped to 1242x375, their image_2 is missing": int(size == IMAGE_SIZE and not image.is_file()),
+            "scans cropped to 1242x375, their image_2 is missing": int(not image.is_file()),
             "scans without an object": int(not part.any()),
             f"boxes left out whose type is none of KITTI's, such as {min(strange, default='')!r}": len(strange),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),

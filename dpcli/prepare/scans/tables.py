@@ -33,6 +33,7 @@ from dpcli.prepare.scans.cloud_series import left_out_below, refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SILENT, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
 from dpcli.prepare.scans.tracked_points import ROWS, identify, name_rows
+from dpcli.prepare.series import is_hidden
 from dpcli.prepare.wide_tables import COLUMNS, hint, read_wide
 from dpcli.runtime.clips.other_files import stand_in
 
@@ -281,5 +282,5 @@ def _tables_below(folder: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
     for place, folders, names in walk_folders(folder):
         folders.sort(key=natural_key)
         for name in sorted(names, key=natural_key):
-            if name.lower().endswith(suffixes) and not name.startswith("."):
+            if name.lower().endswith(suffixes) and not is_hidden(name):
                 yield Path(place) / name

@@ -365,8 +365,9 @@ def test_columns_that_folders_of_a_divided_table_name(tmp_path, option):
 
 def test_recordings_and_packed_files_beside_tables_are_told_as_left_out(tmp_path):
     write(tmp_path / "raw" / "log.csv", frames(3, 4, 7))
-    for name in ("a.bag", "b.mcap", "c.mcap", "d.csv.gz", "readme.md"):
+    for name in ("a.bag", "b.mcap", "c.mcap", "d.csv.gz", "readme.md", "~$log.csv"):
         (tmp_path / "raw" / name).write_bytes(b"")
     reader = TableSequences(tmp_path / "raw")
+    assert [item.name for item in reader.items()] == ["log"]  # and not the lock that a spreadsheet left
     told = "left out: 1 .bag file, 1 .gz file, 2 .mcap files (name the recordings themselves, or unpack them)"
     assert reader.summary(reader.items())[-1] == told

@@ -377,10 +377,10 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, mon
     Image.fromarray(np.rot90(moving(1)[0])).save(folder / "1.png", exif=turned)
     assert video_clip(folder, SMALL).header is not None
     assert [item.problem for item in ClipIndex(folder, SMALL).items()] == [""] * 3
-    Image.new("RGBA", (4000, 4000)).save(folder / "2.png")
-    assert "4000x4000, 0.png is 64x48" in ClipIndex(folder, SMALL).items()[2].problem
+    Image.new("RGBA", (400, 400)).save(folder / "2.png")
+    assert "400x400, 0.png is 64x48" in ClipIndex(folder, SMALL).items()[2].problem
     monkeypatch.setattr("dpcli.prepare.decode.color_frames.read_rgba", None)
-    with pytest.raises(DataError, match="2.png is 4000x4000, 0.png is 64x48"):
+    with pytest.raises(DataError, match="2.png is 400x400, 0.png is 64x48"):
         video_clip(folder, SMALL)
 
 
