@@ -72,8 +72,12 @@ class Rows:
             return told if told is not None or not fps else np.arange(len(since)) / fps
         if fps and (unit := unit_by_rate(column, self.frames, fps)):
             return since * unit
+        if not fps:
+            return None
+        if (since != np.floor(since)).any():  # times in a unit that isn't known
+            return np.arange(len(since)) / fps
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
-        return since / max(int(step), 1) / fps if fps else None
+        return since / max(int(step), 1) / fps
 
     def times_by(self, clock: Clock) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (T), of a frame's earliest row by a clock; None where they don't rise."""

@@ -80,6 +80,7 @@ def test_units_in_the_names_of_times(tmp_path, name, values, expected):
         ("t", [5_000_000, 5_100_000, 5_200_000], 10, [0, 0.1, 0.2]),
         ("t", [0, 1, 2, 5], 10, [0, 0.1, 0.2, 0.5]),
         ("frame", [0, 33, 66], 30, [0, 1 / 30, 2 / 30]),
+        ("time [ticks]", [0.25, 0.5, 0.75], 10, [0, 0.1, 0.2]),
     ],
 )
 def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values, fps, expected):
