@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
@@ -17,13 +16,14 @@ from dpcli.prepare.bounding_sphere import bounding_sphere
 from dpcli.prepare.decode.color_frames import read_rgba
 from dpcli.prepare.views.artemis_files import (
     Motion,
+    Rig,
     Skin,
     declared_frames,
     find_motion,
     has_skin,
     outer_shell,
-    read_intrinsics,
     read_poses,
+    read_rig,
     read_skin,
 )
 from dpcli.prepare.views.masks import read_mask
@@ -69,14 +69,6 @@ class ArtemisOptions:
             raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
 
 
-@dataclass(frozen=True)
-class _Rig:
-    """Holds all cameras of the folder in its own world: intrinsics f64 (V,3,3), poses world_to_camera f64 (V,4,4)."""
-
-    intrinsics: np.ndarray
-    poses: np.ndarray
-
-
 def artemis_config(animal: Path, options: ArtemisOptions) -> dict[str, Any]:
     """Returns options and a digest of cameras and bones, for provenance (the pictures are too many to read twice)."""
     options.check()
@@ -95,10 +87,10 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
 
     The world is turned (the ring's axis becomes y, the reference camera azimuth 0), shifted and scaled so that the
     object's bounding sphere over all frames has radius 0.75 around the origin: from the skinned voxels where the
-    folder has them, else from the silhouettes. Each camera has one square crop around the object over all frames.
+    folder has them, else from the silhouettes of the first frame. Each camera has one square crop around the object over all frames.
     """
     options.check()
-    motion, rig = find_motion(animal, options.motion), _read_rig(animal)
+    motion, rig = find_motion(animal, options.motion), read_rig(animal)
     declared = declared_frames(animal).get(motion.name, 0)
     if declared > len(motion.folders):
         log.warn(
@@ -142,15 +134,6 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
     return Clip(header, pictures, moved, None if skin is None else skin.heaviest.astype(np.int16))
 
 
-def _read_rig(animal: Path) -> _Rig:
-    to_world, intrinsics = read_poses(animal / "CamPose.inf"), read_intrinsics(animal / "Intrinsic.inf")
-    if len(to_world) != len(intrinsics):
-        raise DataError(
-            f"{animal}: CamPose.inf has {counted(len(to_world), 'camera')}, Intrinsic.inf {len(intrinsics)}"
-        )
-    return _Rig(intrinsics, np.linalg.inv(to_world))
-
-
 def _present(motion: Motion, frame: int, count: int) -> list[int]:
     """Returns cameras that have a picture of this frame."""
     found = []
@@ -163,7 +146,7 @@ def _present(motion: Motion, frame: int, count: int) -> list[int]:
     return found
 
 
-def _pick_reference(motion: Motion, frame: int, rig: _Rig, wanted: int | None) -> int:
+def _pick_reference(motion: Motion, frame: int, rig: Rig, wanted: int | None) -> int:
     present = _present(motion, frame, len(rig.poses))
     if not present:
         raise DataError(f"{motion.folders[frame]}: no picture img_0000.jpg to img_{len(rig.poses) - 1:04d}.jpg")
@@ -235,7 +218,7 @@ def _tracks(animal: Path, motion: Motion, frames: list[int], skin: Skin) -> np.n
     return np.stack(places)
 
 
-def _sphere(motion: Motion, frame: int, rig: _Rig) -> tuple[np.ndarray, float]:
+def _sphere(motion: Motion, frame: int, rig: Rig) -> tuple[np.ndarray, float]:
     """Returns center and radius of the object from the silhouettes of all cameras at one frame."""
     cameras, boxes = [], []
     for camera in _present(motion, frame, len(rig.poses)):
@@ -294,7 +277,7 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
     return good, [union([row[at] for row in boxes]) for at in range(len(views))]
 
 
-def _check_tracks(motion: Motion, frame: int, view: int, rig: _Rig, points: np.ndarray) -> None:
+def _check_tracks(motion: Motion, frame: int, view: int, rig: Rig, points: np.ndarray) -> None:
     """Warns when the skinned voxels do not project into the silhouette: then cameras or bones are of another convention."""
     alpha = _alpha(motion, frame, view)[..., 3]
     seen = points @ rig.poses[view][:3, :3].T + rig.poses[view][:3, 3]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import require_folder
 from dpcli.runtime.torch_files import load_plain
@@ -106,6 +107,24 @@ def read_intrinsics(path: Path) -> np.ndarray:
     if not np.isfinite(cameras).all() or (cameras[:, [0, 1], [0, 1]] <= 0).any() or (cameras[:, 2] != [0, 0, 1]).any():
         raise DataError(f"{path}: a K isn't [[fx s cx] [0 fy cy] [0 0 1]] with positive focal lengths")
     return cameras
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Holds all cameras of the folder in its own world: intrinsics f64 (V,3,3), poses world_to_camera f64 (V,4,4)."""
+
+    intrinsics: np.ndarray
+    poses: np.ndarray
+
+
+def read_rig(animal: Path) -> Rig:
+    """Reads the cameras. Raises DataError when their two files hold different numbers of them."""
+    to_world, intrinsics = read_poses(animal / "CamPose.inf"), read_intrinsics(animal / "Intrinsic.inf")
+    if len(to_world) != len(intrinsics):
+        raise DataError(
+            f"{animal}: CamPose.inf has {counted(len(to_world), 'camera')}, Intrinsic.inf {len(intrinsics)}"
+        )
+    return Rig(intrinsics, np.linalg.inv(to_world))
 
 
 def _numbers(path: Path) -> np.ndarray:

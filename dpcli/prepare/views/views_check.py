@@ -15,7 +15,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.color_frames import Frames, image_size, open_frames
 from dpcli.prepare.reader import Item, require_folder
-from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
+from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_rig
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_config
 from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread_frames, warn_gaps
 
@@ -34,16 +34,12 @@ class ArtemisIndex:
 
         Raises DataError when cameras are unknown.
         """
-        poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
-        if len(poses) != len(cameras):
-            raise DataError(
-                f"{self.animal}: CamPose.inf has {counted(len(poses), 'camera')}, Intrinsic.inf {len(cameras)}"
-            )
+        cameras = len(read_rig(self.animal).poses)
         images, declared = require_folder(self.animal / "img", "MOTION/FRAME/"), declared_frames(self.animal)
         there = {path.name for path in images.iterdir() if path.is_dir()}
         names = [self.motion] if self.motion else sorted(there | declared.keys())
         return [
-            Item(name, images / name, problem=self._problem(name, declared.get(name, 0), len(poses))) for name in names
+            Item(name, images / name, problem=self._problem(name, declared.get(name, 0), cameras)) for name in names
         ]
 
     def summary(self, items: list[Item]) -> list[str]:
