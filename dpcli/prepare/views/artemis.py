@@ -108,10 +108,11 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
     test = _choose(motion, frames[0], poses, reference, options)
     roles = ["reference", *["test"] * len(test), *["train"] * len(options.train_cameras)]
     views = [reference, *test, *options.train_cameras]
-    frames, boxes = _plan_clip(motion, frames, views, options.on_error)
+    wanted = frames
+    frames, boxes = _plan_clip(motion, wanted, views, options.on_error)
     crops = [crop_around(box, options.border) for box in boxes]
     if track is not None:
-        track = _tracks(animal, motion, frames, skin)
+        track = track[np.isin(wanted, frames)]
         _check_tracks(motion, frames[0], views[0], rig, track[0])
     header = ViewsHeader(
         f"{animal.resolve().name}-{options.motion}",
