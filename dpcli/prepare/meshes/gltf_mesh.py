@@ -69,10 +69,7 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     if not pieces:
         raise file.fail("has no triangles in its scene; expected a mesh with an animation")
     used = sorted({piece.material for piece in pieces})
-    moved = [_move(file, piece, curves, time, poses) for piece in pieces]
-    if (shift := _middle_far_away([positions for positions, _ in moved])) is not None:
-        poses[..., :3, 3] -= shift
-        moved = [_move(file, piece, curves, time, poses) for piece in pieces]
+    moved, _ = _moved(file, pieces, curves, time, poses)
     for piece, (positions, _) in zip(pieces, moved):
         hidden = ~shown[:, piece.node]
         positions[hidden] = positions[hidden, :1]
@@ -115,6 +112,20 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     )
 
 
+def _moved(
+    file: Gltf, pieces: list[_Piece], clip: Clip, time: np.ndarray, poses: np.ndarray
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray | None]:
+    """Returns positions and normals f32 (T,V,3) of each piece; and the middle f64 (3) of a model far from the origin, which is
+    taken off these and, in place, off the poses f64 (T,N,4,4), or None.
+    """
+    moved = [_move(file, piece, clip, time, poses) for piece in pieces]
+    middle = _middle_far_away([positions for positions, _ in moved]) if moved else None
+    if middle is not None:
+        poses[..., :3, 3] -= middle
+        moved = [_move(file, piece, clip, time, poses) for piece in pieces]
+    return moved, middle
+
+
 def _middle_far_away(positions: list[np.ndarray]) -> np.ndarray | None:
     """Returns the middle f64 (3) of pieces (T,V,3) that lie so far from the origin, as on maps, that 32 bits blur them; else None."""
     low, high = (np.stack([end(x, axis=(0, 1)) for x in positions]).astype(np.float64) for end in (np.min, np.max))
@@ -131,15 +142,10 @@ def shape_at_rest(file: Gltf) -> tuple[np.ndarray, np.ndarray]:
     poses, shown = node_poses(file, parent, _STILL, time), node_visibility(file, parent, _STILL, time)
     pieces = _visible_pieces(file, poses, shown)
     starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
-    moved = [_move(file, piece, _STILL, time, poses)[0] for piece in pieces]
-    shift = _middle_far_away(moved) if moved else None
-    if shift is not None:
-        poses[..., :3, 3] -= shift
-        moved = [_move(file, piece, _STILL, time, poses)[0] + shift for piece in pieces]
+    moved, middle = _moved(file, pieces, _STILL, time, poses)
+    vertices = np.concatenate([np.zeros((0, 3)), *(positions[0] for positions, _ in moved)])
     triangles = [piece.triangles + start for piece, start in zip(pieces, starts)]
-    return np.concatenate([np.zeros((0, 3)), *(positions[0] for positions in moved)]), np.concatenate(
-        [np.zeros((0, 3), np.int64), *triangles]
-    )
+    return vertices if middle is None else vertices + middle, np.concatenate([np.zeros((0, 3), np.int64), *triangles])
 
 
 def _visible_pieces(file: Gltf, poses: np.ndarray, shown: np.ndarray) -> list[_Piece]:
