@@ -32,6 +32,8 @@ COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 51
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MOST = 1 << 27  # entries: a damaged count must not fill the memory
+_ZEROS = 1 << 20  # entries without bytes, of sparse numbers
+_ZEROS_PER_BYTE = 64  # further ones: as many as a compressed mesh may need
 _SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*:")
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _UNPACKED = 4096  # bytes that one of compressed data may make
@@ -96,6 +98,11 @@ class Gltf:
         elif "bufferView" in entry:
             values = self._elements(entry["bufferView"], entry.get("byteOffset", 0), count, columns, dtype, what)
         else:
+            held = sum(map(len, (self.binary or b"", *self._buffers.values())))
+            if count > _ZEROS + _ZEROS_PER_BYTE * held:
+                raise self.fail(
+                    f"{what}: accessor {index} claims {count} entries, and has no bytes; the file is damaged"
+                )
             values = np.zeros((count, columns), dtype)
         if "sparse" in entry and index not in self.decoded:
             values = self._replaced(values, entry["sparse"], what)

@@ -456,6 +456,14 @@ def test_vertex_colors_of_every_range(tmp_path, capsys, values, dtype, more, red
     assert ("are taken as shares of" in capsys.readouterr().err) is (max(values) > 8 and not more)
 
 
+def test_numbers_without_bytes_do_not_fill_the_memory(tmp_path):
+    file = quad()
+    file.tree["accessors"].append({"componentType": 5126, "count": 1 << 27, "type": "VEC3"})
+    file.tree["meshes"][0]["primitives"] = [{"attributes": {"POSITION": len(file.tree["accessors"]) - 1}}]
+    with pytest.raises(DataError, match="claims 134217728 entries, and has no bytes"):
+        load(file, tmp_path)
+
+
 def test_vertex_colors_above_1_make_brighter(tmp_path):
     file = quad()
     file.tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.1, 0.1, 0.1, 1]
