@@ -27,7 +27,7 @@ _ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the cam
 _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that lie beside
     r"normals?|colou?rs?|rgb|flows?|feat(ure)?s?|seg\w*|masks?|intensit(y|ies)|reflect\w*|weights?|ids?", re.IGNORECASE
 )
-_LOOKED_AT = 1000  # lines of a text that may hold poses: as many points have edges among them
+_LOOKED_AT = 20, 1000  # lines of a text that may hold poses; of so many points some lie at edges
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
     " .pcap .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
@@ -188,11 +188,14 @@ def is_pose(path: Path) -> bool:
 
     That is a 4x4 or 3x4 matrix that turns, one in each row, or rows that end with a quaternion, as KITTI and TUM have them.
     """
-    if path.suffix.lower() not in TEXTS:
-        return False
+    return path.suffix.lower() in TEXTS and all(_begins_with_poses(path, count) for count in _LOOKED_AT)
+
+
+def _begins_with_poses(path: Path, count: int) -> bool:
+    """Returns whether the first lines of a text hold poses and nothing else."""
     try:
         with path.open() as file:
-            lines = [line for line in islice(file, _LOOKED_AT) if line.strip() and not line.startswith("#")]
+            lines = [line for line in islice(file, count) if line.strip() and not line.startswith("#")]
         rows = [[float(v) for v in line.replace(",", " ").split()] for line in lines]
     except ValueError:  # words, or no text at all
         return False
