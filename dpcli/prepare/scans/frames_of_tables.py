@@ -117,7 +117,8 @@ def split_rows(table: Table, column: str, sequence_column: str = "", gap: float 
     if not len(frames):
         raise DataError(f"{table.path}: a table without rows; expected numbers in columns")
     if gap is not None and numbers is None:
-        raise DataError(f"{table.path}: --gap needs numbers in {column!r}; it holds words such as {frames[0]!r}")
+        word = table.words(table.names.index(column))[0]
+        raise DataError(f"{table.path}: --gap needs numbers in {column!r}; it holds words such as {word!r}")
     groups = _groups(table, sequence_column, len(frames))
     found = []
     for name, rows in groups:

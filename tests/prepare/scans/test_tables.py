@@ -242,7 +242,7 @@ def test_tables_that_cannot_be_split(tmp_path):
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
     assert "1 row without a number in 'frame', the first is 1" in item.problem
     (item,) = TableSequences(write(tmp_path / "c.csv", [("p", 1, 2, 3)]), gap=2).items()
-    assert "--gap needs numbers" in item.problem
+    assert "--gap needs numbers in 'frame'; it holds words such as 'p'" in item.problem
     with pytest.raises(UsageError, match="--gap 0: expected more than 0"):
         TableSequences(tmp_path / "a.csv", gap=0)
     with pytest.raises(DataError, match="does not exist"):
