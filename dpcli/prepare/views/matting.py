@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from functools import reduce
-from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.views.masks import read_mask
 
 TOLERANCE = 0.06  # of the value range: compression noise of a video stays below
 FAINT = 8  # alpha below is a leftover of compression or of a network, not the object
@@ -235,11 +233,6 @@ def fades_to_black(rgba: np.ndarray) -> bool:
 def clear_invisible(rgba: np.ndarray) -> np.ndarray:
     """Clears faint alpha to 0, and invisible color to black: equal objects give equal bytes."""
     return rgba * (rgba[..., 3:] >= FAINT)
-
-
-def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
-    """Returns the frame u8 (H,W,4) with the alpha of a mask file. Raises DataError as `with_alpha` does."""
-    return with_alpha(rgba, read_mask(mask), str(mask), name)
 
 
 def with_alpha(rgba: np.ndarray, alpha: np.ndarray, mask: str, name: str) -> np.ndarray:

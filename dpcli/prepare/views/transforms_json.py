@@ -14,6 +14,7 @@ from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
+from dpcli.prepare.views.masks import read_mask
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_of_cameras
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
 from dpcli.prepare.views.transforms_cameras import View, named_up, read_views, transforms_files
@@ -98,9 +99,9 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
 
 
 def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:
-    path = view.paths[time]
-    if time in view.masks:
-        return matting.with_mask(read_rgba(path), view.masks[time], path.name)
+    path, mask = view.paths[time], view.masks.get(time)
+    if mask:
+        return matting.with_alpha(read_rgba(path), read_mask(mask), str(mask), path.name)
     return matting.cut_alone(read_rgba(path), str(path), options.background, options.tolerance, options.holes)
 
 
