@@ -234,6 +234,14 @@ def test_pil_bicubic_is_of_eight_bits_in_floats(name: str, side: int):
     assert prepare_frame(VARIANTS["disco"], edge).max() > 1.001  # overshoots are kept
 
 
+def test_features_on_a_gpu_would_not_round():
+    """TF32, torch's default for convolutions, is off while a network runs, and back afterwards."""
+    network, seen, before = FeatureNetwork(VARIANTS["disco"], Color()), [], torch.backends.cudnn.allow_tf32
+    network.module.register_forward_hook(lambda *_: seen.append(torch.backends.cudnn.allow_tf32))
+    network.features([torch.zeros(3, 32, 32)] * 2)
+    assert seen == [False] and torch.backends.cudnn.allow_tf32 is before
+
+
 def test_a_whole_video_is_one_clip_and_windows_slide():
     for name, frames, clips, lengths in (("videogpt", 12, 1, [12]), ("disco", 20, 5, [16] * 5), ("r3d50", 16, 1, [16])):
         network = FeatureNetwork(VARIANTS[name], Color())

@@ -75,8 +75,10 @@ class FeatureNetwork:
         """Returns the features f64 (D) of one clip of prepared frames f32 (3,h,w)."""
         import torch
 
+        from dpcli.evaluate.networks import full_precision
+
         clip = torch.stack(tuple(frames), dim=1)[None] if self.variant.clip != 1 else torch.stack(tuple(frames))
-        with torch.inference_mode():
+        with torch.inference_mode(), full_precision():
             return self.module(clip.to(self.device)).double().cpu().numpy()[0]
 
 
