@@ -230,6 +230,11 @@ def test_numbers_are_written_with_their_units():
         (b'{"task": "a", "metrics": 3}', "metrics is a int"),
         (b'{"task": "a", "metrics": {"x": NaN}}', "not JSON"),
         (b'{"task": "a", "provenance": ["x"]}', "provenance is not a list"),
+        (b'{"task": "a", "notes": 3}', "notes is a int"),
+        (b'{"task": "a", "left_out": [{"reason": "x", "names": 3}]}', "names is a int"),
+        (b'{"task": "a", "metrics": {"streams": 2.5}}', "streams is a float"),
+        (b'{"task": "motion", "metrics": {"thresholds": true}}', "thresholds is a bool"),
+        (b'{"task": "classification", "metrics": {"per_class": 7}}', "per_class is a int"),
         (b'{"task": "classification", "metrics": {"confusion": [[1, 2]]}}', "confusion has shape (1, 2)"),
         (b'{"task": "classification", "metrics": {"streams": {"a": 3}}}', "can't be shown"),
     ],
@@ -238,7 +243,7 @@ def test_what_is_no_result_is_said(tmp_path, content, words):
     path = tmp_path / "x.json"
     path.write_bytes(content)
     with pytest.raises(DataError, match=re.escape(words)) as caught:
-        arrange(collect([str(path)]))
+        arrange(collect([str(path)]), beside=["table-3.4", "table-B.3"])
     assert str(path) in str(caught.value)
 
 
