@@ -155,6 +155,7 @@ class FramePass:
         """Yields a function that scores a frame for each frame; pictures are read as they are needed."""
         view = self.truth.views[theirs]
         for frame, predicted, truth in self._finite_frames(ours, theirs, count, damaged, self.watch):
+            check_size(truth.size, self.protocol, self.metrics, str(self.truth.path))
             self._look_for_mistakes(predicted, truth, f"view {view.title!r}, frame {frame}")
             yield lambda f=frame, p=predicted, t=truth: score_frame(f, p, t, self.protocol, self.metrics)
 
@@ -184,8 +185,6 @@ class FramePass:
                 f"{self.predicted.path}: {where} is {ours}, but {theirs} in {self.truth.path}; render or resize "
                 "to that size, or --protocol consistent4d resizes both"
             )
-        if self.size == (0, 0):
-            check_size(truth.size, self.protocol, self.metrics, str(self.truth.path))
         self.size = truth.size
 
     def _look_for_mistakes(self, predicted: Picture, truth: Picture, where: str) -> None:

@@ -208,9 +208,13 @@ def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
     assert len(evaluate_video(truth, none, metrics=("psnr", "ssim")).views) == 4
 
 
-def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> None:
+def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="32x24; ms_ssim needs at least 176 pixels"):
         evaluate_video(said, truth, metrics=("ms_ssim",))
+    for view, side in (("0", 16), ("1", 10)):
+        write_folder(tmp_path / "views" / view, np.full((1, side, side, 4), 99, np.uint8))
+    with pytest.raises(DataError, match="10x10; ssim needs at least 11 pixels"):  # of a later view, too
+        evaluate_video(tmp_path / "views", tmp_path / "views", metrics=("ssim",))
     assert parse_video_metrics("ssim, psnr") == ("psnr", "ssim") and parse_video_metrics(None) is None
     for wrong in ("psnr,lpip", "", ","):
         with pytest.raises(
