@@ -24,10 +24,11 @@ from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
 from dpcli.evaluate.report.blocks import Table, interval_text, sort_key, table, text_of
-from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
+from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud, part_blocks
 from dpcli.evaluate.report.markdown_and_latex import escape_latex
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
+from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
 from tests.support.report_helpers import EVIL
 
 _FLAGS = "--disable-gpu --virtual-time-budget=3000 --window-size=700,600 --enable-logging=stderr".split()
@@ -379,6 +380,18 @@ def test_a_cloud_is_packed_up_to_rounding():
     rest = np.frombuffer(data[42:], np.uint8).reshape(3, 7)
     assert rest[0].tolist() == [0, 1, 2, 3, 1, 2, 255] and rest[1].tolist() == [1, 0, 2, 3, 1, 2, 3]
     assert rest[2].tolist() == [0, 0, 64, 128, 255, 32, 191]
+
+
+@pytest.mark.parametrize("unit", ["m", ""])
+def test_the_color_of_a_cloud_is_named_by_what_it_shows(tmp_path, unit):
+    """End-point errors where a pair begins at the frame shown, whether the files name a unit or not; else wrong parts."""
+    sequences = [truth_sequence(f"s{k}", seed=k) for k in range(2)]
+    truth = write_truth(tmp_path / "t.h5", sequences, length_unit=unit)
+    for pairs, told in ((CHAIN, "red: end-point error up to"), (CHAIN[:0], "red: wrong part")):
+        samples = [perfect(one, 4, pairs) for one in sequences]
+        parts = write_parts(tmp_path / f"{len(pairs)}.h5", samples, length_unit=unit)
+        (cloud,) = (own for own in part_blocks(parts, truth, motion=True) if own.title == "Error clouds")
+        assert cloud.html.count(told) == 2
 
 
 def test_predicted_parts_take_the_names_of_the_true_ones():
