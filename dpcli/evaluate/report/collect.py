@@ -169,7 +169,10 @@ def _check_result(found: Any, where: str) -> dict[str, Any]:
         if not isinstance(entries, list) or not all(isinstance(own, dict) for own in entries):
             raise DataError(f"{where}: {key} is not a list of objects; print the result again")
     lists = [("notes", found), *(("names", entry) for entry in found.get("left_out", []))]
-    parts = [*((key, found.get("metrics", {}), kind) for key, kind in _INSIDE.items()), *((*own, list) for own in lists)]
+    parts = [
+        *((key, found.get("metrics", {}), kind) for key, kind in _INSIDE.items()),
+        *((*own, list) for own in lists),
+    ]
     for key, own, kind in parts:
         if not isinstance(own.get(key, kind()), kind):
             raise DataError(f"{where}: {key} is a {type(own[key]).__name__}; print the result again")

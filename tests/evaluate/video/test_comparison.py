@@ -233,6 +233,9 @@ def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path:
     expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
     change = found["metrics"]["psnr"]
     assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
+    with pytest.raises(UsageError, match="--metrics fvd: protocol disco takes it of all views at once"):
+        pooled = [*command[:5], "--metrics", "psnr,fvd", "--protocol", "disco"]
+        raise CliRunner().invoke(evaluate.ROOM.application(), pooled).exception
     with pytest.raises(UsageError, match="a video holds no truth"):
         raise CliRunner().invoke(evaluate.ROOM.application(), ["compare", str(said), str(worse)]).exception
     runs = CliRunner().invoke(
