@@ -13,6 +13,7 @@ from dpcli.evaluate.report.blocks import Figure, Table
 from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.evaluate.results import KEPT_STATISTICS
+from dpcli.evaluate.video.sources.open_source import is_media
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.file import MAGIC, is_hdf5
 from dpcli.store.pipes import standard_input
@@ -73,7 +74,7 @@ def _results_of(
     if argument == "-":
         return _parse_objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _split_pair(argument)
-    if path.is_file() and not is_hdf5(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
+    if path.is_file() and own is None and not is_hdf5(path) and not is_media(path):
         return _parse_objects(path.read_bytes(), str(path), pictures)
     kind = file_kind(path) if path.is_file() and is_hdf5(path) else "video"
     if kind == "scores":

@@ -259,6 +259,10 @@ def test_what_is_missing_is_said(parts, truth, tmp_path):
         collect([str(truth)])
     with pytest.raises(UsageError, match="only once"):
         collect(["-", "-"])
+    for name in ("a.mp4", "a.webm"):
+        (tmp_path / name).write_bytes(b"\x1a\x45\xdf\xa3")
+        with pytest.raises(DataError, match=r"holds 'video', which has no result in it; .* PRED=TRUTH"):
+            collect([str(tmp_path / name)])
 
 
 def test_unknown_tasks_are_shown_and_duplicates_named(tmp_path):
