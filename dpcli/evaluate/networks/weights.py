@@ -106,15 +106,10 @@ def find_weights(name: str, folder: Path) -> Path:
 
 def how_to_get(weights: Weights, missing: Weights, folder: Path) -> str:
     """Returns what to do about a missing file, in half a line."""
-    by_hand = f"download {missing.url} ({size_text(missing)}) to {folder / missing.file}"
+    by_hand = f"download {missing.url} ({bytes_text(missing.size, missing.about)}) to {folder / missing.file}"
     if weights.by_hand:
         return f"{by_hand} (from that page, by hand)"
     return f"run `dpc evaluate weights fetch {weights.name}`, or {by_hand}"
-
-
-def size_text(weights: Weights) -> str:
-    """Returns the size of one file in words; the sum with those beside it is the caller's."""
-    return bytes_text(weights.size, weights.about)
 
 
 def bytes_text(count: int, about: bool = False) -> str:

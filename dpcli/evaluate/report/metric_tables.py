@@ -30,13 +30,13 @@ _LONGEST_CURVE = 400
 
 def headline(found: Mapping[str, Any]) -> Headline:
     """Returns the metric a result is known by: the first of the usual ones, else a difference or mean, else its first number."""
-    metrics, units, of = found.get("metrics", {}), found.get("units", {}), denominator(found)
+    metrics, units = found.get("metrics", {}), found.get("units", {})
     plain = {key: value for key, value in metrics.items() if is_number(value)}
     for key in (*_HEADLINES, *plain):
         if key in plain:
             unit = _unit_of(units, key)
             ends = metrics.get(f"{key}_interval") or intervals_of(found).get(key)
-            return Headline(_with_unit(key, unit), cell(plain[key], unit), interval_text(ends, unit), of)
+            return Headline(_with_unit(key, unit), cell(plain[key], unit), interval_text(ends, unit))
     for key, record in metrics.items():
         for name in ("difference", "mean"):
             if isinstance(record, Mapping) and is_number(record.get(name)):
@@ -45,9 +45,8 @@ def headline(found: Mapping[str, Any]) -> Headline:
                     f"{name} of {_with_unit(key, unit)}",
                     cell(record[name], unit),
                     interval_text(record.get("interval"), unit),
-                    of,
                 )
-    return Headline("-", Cell("-"), "", of)
+    return Headline("-", Cell("-"))
 
 
 def denominator(found: Mapping[str, Any]) -> str:

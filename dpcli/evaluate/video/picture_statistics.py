@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.evaluate.proportions import divide, mean_defined
-from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video.psnr import psnr_of
 from dpcli.evaluate.video.ssim import multi_scale, similarity
 
@@ -34,10 +33,6 @@ class PictureStatistics:
     multi_scale: np.ndarray
     overlap: np.ndarray
     union: np.ndarray
-
-    def __add__(self, other: PictureStatistics) -> PictureStatistics:
-        """Returns the statistics of both sets of frames together."""
-        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)

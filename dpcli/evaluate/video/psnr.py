@@ -50,7 +50,7 @@ def psnr_of(squared: np.ndarray | float, values: np.ndarray | float, data_range:
     """
     mean = divide(squared, values)
     with np.errstate(divide="ignore"):
-        return np.minimum(10 * np.log10(divide(np.square(data_range), 1.0)) - 10 * np.log10(mean), PSNR_CAP)
+        return np.minimum(10 * np.log10(np.square(data_range)) - 10 * np.log10(mean), PSNR_CAP)
 
 
 def psnr(

@@ -233,7 +233,7 @@ def random_frames(seed: int, count: int = 4) -> list[Frame]:
 def test_shards_add_up_exactly(protocol):
     objects = [segmentation_update(random_frames(seed), ignore_below=8, protocol=protocol) for seed in range(6)]
     whole = segmentation_compute(merge_statistics(objects), protocol)
-    halves = merge_statistics(objects[:2]) + merge_statistics(objects[2:])
+    halves = merge_statistics([merge_statistics(objects[:2]), merge_statistics(objects[2:])])
     assert segmentation_compute(halves, protocol) == whole
     with pytest.raises(DataError, match="no statistics"):
         merge_statistics([])

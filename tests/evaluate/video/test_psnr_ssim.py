@@ -167,7 +167,7 @@ def test_shards_merge_to_the_whole() -> None:
     mask_of = [mask, np.zeros_like(mask), *[mask] * 5]
     rows = [picture_update(i, frames[2 * i], frames[2 * i + 1], mask=mask_of[i]) for i in range(7)]
     whole = picture_compute(merge_statistics(rows))
-    shards = picture_compute(merge_statistics(rows[:3]) + merge_statistics(rows[3:]))
+    shards = picture_compute(merge_statistics([merge_statistics(rows[:3]), merge_statistics(rows[3:])]))
     assert replace(shards, ms_ssim=0, silhouette_iou=0) == replace(whole, ms_ssim=0, silhouette_iou=0)
     each = [psnr(*(np.moveaxis(f, 0, -1) for f in frames[2 * i : 2 * i + 2])) for i in range(7)]
     assert whole.psnr == pytest.approx(np.mean(each)) and whole.worst == int(np.argmin(each))

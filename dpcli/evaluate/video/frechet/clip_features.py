@@ -182,14 +182,14 @@ class FeatureDistance:
     each: tuple[float, ...] = ()
 
 
-def video_distance(variant: FeatureVariant, pairs: Sequence[VideoPair], root: str | None = None) -> FeatureDistance:
-    """Returns the variant's distance over videos (views, objects), as its aggregation says. root: another than the variant's.
+def video_distance(variant: FeatureVariant, pairs: Sequence[VideoPair]) -> FeatureDistance:
+    """Returns the variant's distance over videos (views, objects), as its aggregation says.
 
     Raises DataError for no videos, and for a single clip where a distribution is needed.
     """
     if not pairs:
         raise DataError(f"{variant.metric} ({variant.name}): no videos to compare")
-    options = {"root": root or variant.root, "single": variant.single}
+    options = {"root": variant.root, "single": variant.single}
     each: tuple[float, ...] = ()
     if variant.aggregation == "pooled":
         predicted, truth = (feature_merge(getattr(pair, side) for pair in pairs) for side in ("predicted", "truth"))
