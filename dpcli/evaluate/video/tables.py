@@ -18,8 +18,8 @@ from dpcli.evaluate.video.frame_pass import ViewScore
 from dpcli.evaluate.video.learned.base import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import describe_protocol
-from dpcli.evaluate.video.psnr import PSNR_CAP
 from dpcli.evaluate.video.surface import CAMERAS, MOST_POINTS, SHARES, SurfaceScore
 
 

@@ -14,11 +14,11 @@ from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import parse_video_metrics
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
-from dpcli.evaluate.video.psnr import PSNR_CAP, psnr
-from dpcli.evaluate.video.ssim import ssim, ssim_reference
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
+from tests.support.picture_metrics import psnr, ssim, ssim_reference
 from tests.support.scenes import toy_scene
 from tests.support.video_clips import FRAMES, HEIGHT, ROLES, WIDTH, clip, header, white, write, write_folder
 

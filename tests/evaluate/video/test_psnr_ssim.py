@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.errors import DataError
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video import ssim as ssim_module
-from dpcli.evaluate.video.picture_statistics import picture_compute, picture_update
-from dpcli.evaluate.video.psnr import PSNR_CAP, planar, psnr
-from dpcli.evaluate.video.ssim import ms_ssim, ssim, ssim_reference
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP, picture_compute, picture_update
+from tests.support.picture_metrics import ms_ssim, planar, psnr, ssim, ssim_reference
 
 
 def waves(side: int = 192) -> tuple[np.ndarray, np.ndarray]:
@@ -176,18 +174,8 @@ def test_shards_merge_to_the_whole() -> None:
     assert whole.psnr_foreground == pytest.approx(np.mean(objects)) and np.isnan(whole.ms_ssim)
 
 
-def test_wrong_ranges_and_values_are_said() -> None:
+def test_pictures_too_small_and_other_borders_are_said() -> None:
     good = np.full((16, 16, 3), 0.5)
-    with pytest.raises(DataError, match="prediction has values up to 127.5, but data_range is 1"):
-        psnr(255 * good, good)
-    with pytest.raises(DataError, match="both pictures have values up to 0.5, but data_range is 255"):
-        ssim(good, good, data_range=255)
-    broken = good.copy()
-    broken[3, 4, 1] = np.nan
-    with pytest.raises(DataError, match="the truth has 1 values that are NaN"):
-        ssim(good, broken)
-    with pytest.raises(ValueError, match="expected equal"):
-        ssim(good, good[:-1])
     with pytest.raises(ValueError, match="at least 11 x 11"):
         ssim(good[:10], good[:10])
     with pytest.raises(ValueError, match="at least 176 pixels"):

@@ -25,8 +25,8 @@ from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
 from dpcli.evaluate.video.frechet.variants import feature_variant
 from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
-from dpcli.evaluate.video.ssim import ssim_reference
 from tests.evaluate.video.test_comparison import FRAMES, clip, header, white, write
+from tests.support.picture_metrics import ssim_reference
 
 ROLES = ("reference", "test", "test")
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
-from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.sources.open_source import open_source
 from dpcli.runtime.progress import log
 from dpcli.store.gaussians import write_scene
