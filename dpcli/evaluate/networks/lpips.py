@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks import full_precision
 from dpcli.evaluate.networks.lpips_trunks import alexnet, squeezenet, vgg16
-from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
-from dpcli.evaluate.networks.weights import find_weights
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
+from dpcli.evaluate.networks.weights import whole_weights
 
 HEADS = Path(__file__).parent / "heads"  # the linear weights, BSD-2, see LPIPS.md there
 NETS = {"alex": (alexnet, "alexnet"), "vgg": (vgg16, "vgg16"), "squeeze": (squeezenet, "squeezenet")}
@@ -42,8 +42,8 @@ class Lpips(nn.Module):
     def load(cls, net: str, folder: Path) -> Lpips:
         """Loads the published trunk from the weights folder. Raises DataError when absent, damaged or another network's."""
         made = cls(net)
-        name = NETS[net][1]
-        fill_module(made.trunk, load_weights(name, folder), find_weights(name, folder))
+        path = whole_weights(NETS[net][1], folder)
+        fill_module(made.trunk, load_tensors(path), path)
         return made
 
     @torch.no_grad()

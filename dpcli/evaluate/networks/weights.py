@@ -157,6 +157,18 @@ def _check_digest(found: str, weights: Weights) -> Checked:
     )
 
 
+def whole_weights(name: str, folder: Path, *, digest: bool = False) -> Path:
+    """Returns where the weights `name` lie, after their size, and with `digest` their SHA-256, was compared.
+
+    Raises DataError when they are absent, as `find_weights`, or damaged.
+    """
+    path = find_weights(name, folder)
+    found = check_file(path, weights_named(name), digest)
+    if found.state != "present":
+        raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
+    return path
+
+
 def check_weights(weights: Weights, folder: Path, digest: bool = True) -> Checked:
     """Checks an entry with all its files; the state is that of the first one that isn't present."""
     found = [check_file(folder / each.file, each, digest) for each in weights.files]

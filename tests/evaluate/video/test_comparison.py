@@ -18,6 +18,7 @@ from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
+from tests.support.commands import told
 from tests.support.picture_metrics import psnr, ssim, ssim_reference
 from tests.support.scenes import toy_scene
 from tests.support.video_clips import FRAMES, HEIGHT, ROLES, WIDTH, clip, header, white, write, write_folder
@@ -292,12 +293,12 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)
 
 
-def test_a_pipe_is_read(dpc, said: Path, truth: Path) -> None:
-    piped = dpc("evaluate", "video", "-", "--truth", truth, "--json", stdin=said.read_bytes())
-    assert piped.returncode == 0, piped.stderr.decode()
+def test_a_pipe_is_read(said: Path, truth: Path) -> None:
+    words = ["video", "-", "--truth", str(truth), "--json"]
+    piped = CliRunner().invoke(evaluate.ROOM.application(), words, input=said.read_bytes())
     assert json.loads(piped.stdout)["metrics"] == json.loads(run(said, "--truth", truth, "--json").stdout)["metrics"]
-    wrong = dpc("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
-    assert wrong.returncode == 2 and wrong.stdout == b"" and b"--protocol svd" in wrong.stderr
+    wrong = told("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
+    assert (wrong.returncode, wrong.stdout) == (2, "") and "--protocol svd" in wrong.stderr
 
 
 def scene_views(folder: Path, size: int = 64) -> tuple[Path, Path]:
