@@ -23,7 +23,8 @@ _EXPECTED = (
     "expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
     "or a video as PRED=TRUTH"
 )
-_MAPPINGS, _LISTS = ("metrics", "protocol", "units", "denominators", "intervals"), ("left_out", "provenance")
+_MAPPINGS = ("metrics", "protocol", "units", "denominators", "intervals", "surface_intervals")
+_LISTS = ("left_out", "provenance")
 _INSIDE = {"per_class": list, "thresholds": list, "streams": dict}  # of `metrics`, where they are
 _VIDEO = ("views", "gaussians")
 

@@ -95,19 +95,28 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
 
 
 def intervals_of(found: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Returns [low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found."""
-    own = found.get("intervals", {})
-    return own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
+    """Returns [low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found.
+
+    Those of a scene's surface, of which frames are resampled, have a place of their own.
+    """
+    own, surface = found.get("intervals", {}), found.get("surface_intervals", {}).get("metrics")
+    own = own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
+    return {**surface, **own} if isinstance(surface, Mapping) else own
 
 
 def _interval_note(found: Mapping[str, Any]) -> str:
-    """Returns how the intervals were found, in a sentence; "" without any."""
-    own = found.get("intervals", {})
+    """Returns how the intervals were found, in sentences; "" without any."""
+    how, of_surface = (_how_resampled(found.get(key, {})) for key in ("intervals", "surface_intervals"))
+    wilson = how and "accuracy_interval" in found.get("metrics", {})
+    said = ((how, "Intervals: "), ("Wilson" if wilson else "", "Of accuracy: "), (of_surface, "Of the surface: "))
+    return " ".join(f"{opening}{words}." for words, opening in said if words)
+
+
+def _how_resampled(own: Mapping[str, Any]) -> str:
     if not own.get("resamples") or not is_number(own.get("confidence")):
         return ""
     of = f"{own.get('number', '')} {own.get('resampled', '')}".strip()
-    how = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
-    return f"Intervals: {how}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
+    return f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
 
 
 def _grouped_metrics(metrics: Mapping[str, Any]) -> dict[str, Mapping]:

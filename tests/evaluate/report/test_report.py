@@ -127,8 +127,12 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
 def test_intervals_say_their_level_and_what_is_no_number_is_no_metric(scores, resamples, level):
     """The scores are no probabilities: without a reliability diagram, which is no metric of its own."""
     report = evaluate_classification(scores, resampling=Resampling(resamples, 0.8))
+    report.rejected = np.arange(30) < 10
     words = json.dumps(classification_json(report, "s.h5"))
     (section,) = arrange(collect(["-"], stdin=BytesIO(words.encode()))).sections
+    assert section.notes[0].startswith(
+        f"Something was recognized in 20 samples, of which {report.accepted[1]} are right"
+    )
     tables = {own.key: own for own in section.blocks if isinstance(own, Table)}
     assert tables["streams"].header[2] == level
     assert [row[0].text for row in tables["metrics"].rows] == [

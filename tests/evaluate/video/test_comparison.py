@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import parse_video_metrics
+from dpcli.evaluate.report import arrange, collect
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
 from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
@@ -386,6 +388,11 @@ def test_a_scene_is_rendered_at_the_truths_cameras_and_times(tmp_path: Path) -> 
     low, high = found["surface_intervals"]["metrics"]["f_score_2"]
     assert 0 < low <= surface["f_score_2"] <= high <= 1 and surface["f_score_1"] <= surface["f_score_2"]
     assert surface["chamfer_of_diameter"] == pytest.approx(surface["chamfer"] / surface["diameter"])
+    words = json.dumps(found).encode()
+    metrics = arrange(collect(["-"], stdin=BytesIO(words), pictures=False)).sections[0].blocks[0]
+    shown = {row[0].text: row[2].text for row in metrics.rows}
+    assert shown["surface f score 2"] == f"{100 * low:.1f} to {100 * high:.1f} %"
+    assert "Of the surface: 95 %, bootstrap, BCa, 2000 resamples of 5 frames." in metrics.note
     text = run(scene, "--truth", views, "--metrics", "surface").stdout
     assert "F-score at 2 %" in text and "300 true points" in text
 
