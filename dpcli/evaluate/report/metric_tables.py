@@ -22,7 +22,7 @@ from dpcli.evaluate.report.blocks import (
 from dpcli.evaluate.report.charts import curve, histogram
 
 _HEADLINES = ("accuracy", "ap", "epe3d", "psnr", "lpips", "fvd", "miou", "ssim", "adjusted_rand_index")
-_COUNTS = ("samples", "sequences", "views", "frames", "pairs", "n", "runs")
+_COUNTS = ("samples", "sequences", "recordings", "views", "frames", "pairs", "n", "runs")
 _UNITLESS = ("p", "p_value", "wilcoxon_p", "n", "count", "wins", "losses", "ties", "label", "frame", "seed")
 _SPREAD_OF = ("per_sequence", "per_frame", "per_sample", "per_video", "per_object")
 _LONGEST_CURVE = 400
@@ -52,8 +52,8 @@ def headline(found: Mapping[str, Any]) -> Headline:
 def denominator(found: Mapping[str, Any]) -> str:
     """Returns the first counts of the object, in words.
 
-    >>> denominator({"denominators": {"samples": 231, "classes": 20}})
-    '231 samples'
+    >>> denominator({"denominators": {"samples": 231, "classes": 20}}), denominator({"denominators": {"recordings": 2, "frames": 50}})
+    ('231 samples', '2 recordings, 50 frames')
     """
     counts = found.get("denominators", {})
     for own in [own for own in counts.values() if isinstance(own, Mapping)]:  # of a comparison: by what is compared

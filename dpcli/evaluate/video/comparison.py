@@ -137,11 +137,12 @@ def _learned_scores(
         return {}, {}
     made, missing = load_metrics(names, frames.protocol.networks, folder, device)
     others = replace(frames.protocol, views=frames.protocol.learned_views or frames.protocol.views)
-    second = replace(frames, left_out=[])
+    second = replace(frames, left_out=[], hollow=0)
     if made:
         pairs = match_views(frames.predicted, frames.truth, others, frames.intersect, second.left_out)
         second.feed(pairs, made, missing)
-    frames.size = second.size
+    frames.size, frames.misnumbered, frames.swapped = second.size, second.misnumbered, second.swapped
+    frames.hollow = frames.hollow or second.hollow
     frames.left_out.extend(entry for entry in second.left_out if entry not in frames.left_out)  # each is said once
     scores = {}
     for name, metric in made.items():

@@ -81,11 +81,13 @@ class FramePass:
             for ours, theirs, count in counts:
                 self._call_each(metrics, missing, "start", self.truth.views[theirs].title)
                 for frame, predicted, truth in self._finite_frames(ours, theirs, count, damaged):
+                    self._look_for_mistakes(predicted, truth, f"view {self.truth.views[theirs].title!r}, frame {frame}")
                     pair = (scaled(picture, self.protocol) for picture in (predicted, truth))
                     self._call_each(metrics, missing, "add", *pair, frame)
                     progress.advance()
                 self._call_each(metrics, missing, "end")
         self._refuse_damaged(damaged)
+        self._refuse_dim()
 
     @staticmethod
     def _call_each(metrics: dict[str, LearnedMetric], missing: dict[str, str], verb: str, *given: Any) -> None:
@@ -202,15 +204,18 @@ class FramePass:
     def _check_plausible(self, scores: list[ViewScore], counts: list) -> None:
         if not scores and counts:
             raise DataError(f"{self.predicted.path}: every frame has NaN or infinite pixels; nothing to compare")
-        if self.brightest[0] == 1 < self.brightest[1]:
-            raise DataError(
-                f"{self.predicted.path}: 8-bit pictures with no value above 1; colors in 0..1 were saved without "
-                "multiplying by 255"
-            )
+        self._refuse_dim()
         if "psnr_foreground" in self.metrics and scores and not any(score.metrics.object_pixels for score in scores):
             raise DataError(
                 f"{self.truth.path}: no frame has an object (alpha is below one half everywhere); mask it "
                 "(`dpc prepare video`), or leave out psnr_foreground"
+            )
+
+    def _refuse_dim(self) -> None:
+        if self.brightest[0] == 1 < self.brightest[1]:
+            raise DataError(
+                f"{self.predicted.path}: 8-bit pictures with no value above 1; colors in 0..1 were saved without "
+                "multiplying by 255"
             )
 
     def notes(self) -> list[str]:
