@@ -44,13 +44,12 @@ class Resampling:
         if self.resamples < 0 or 0 < self.resamples < 100:
             raise UsageError(f"--resamples {self.resamples}: expected 100 or more, or 0 for no intervals")
 
-    def intervals(self, metric: WeightedMetric, samples: int, method: str = "bca") -> dict[str, Interval]:
+    def intervals(self, metric: WeightedMetric, samples: int) -> dict[str, Interval]:
         """Returns the interval of each metric over `samples` samples; no intervals when `resamples` is 0."""
         if self.resamples == 0:
             return {}
-        return bootstrap(
-            metric, samples, generator(self.seed), resamples=self.resamples, confidence=self.confidence, method=method
-        )
+        rng = generator(self.seed)
+        return bootstrap(metric, samples, rng, resamples=self.resamples, confidence=self.confidence)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ CLASSIFICATION_METRICS = ("accuracy", f"top{TOP_K}_accuracy", "balanced_accuracy
 SEGMENTATION_METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri", "ari")
 MOTION_METRICS = ("epe3d", "accs", "accr", "outlier", "part_rotation", "part_displacement")
 PICTURE_METRICS = ("psnr", "psnr_foreground", "ssim", "ms_ssim", "silhouette_iou")
+PICTURE_UNITS = {name: "dB" if name.startswith("psnr") else "1" for name in PICTURE_METRICS}
 FRECHET_METRICS = ("fvd", "fid_vid_r3d50", "fid_vid_inception")
 LEARNED_METRICS = ("lpips", "clip", "clip_spherical", "clip_views", "clip_temporal", *FRECHET_METRICS, "warping")
 SCENE_METRICS = ("parts", "tracks", "surface")

@@ -38,11 +38,8 @@ TITLES = {
     "clip_temporal": "CLIP over time",
     "macro_f1": "macro F1",
     "top5_accuracy": "top-5 accuracy",
-    "sd": "sd",
-    "p": "p",
     "adjusted_rand_index": "adjusted Rand index",
     "epe": "EPE",
-    "tau": "tau",
 }
 
 
@@ -53,3 +50,13 @@ def title_of(key: str) -> str:
     ('mIoU', 'part rotation')
     """
     return TITLES.get(key, str(key).replace("_", " "))
+
+
+def metric_title(key: str, unit: str) -> str:
+    """Returns a metric's name as tables have it, with its unit; fractions are shown in percent.
+
+    >>> metric_title("miou", "fraction"), metric_title("epe3d", "m"), metric_title("ssim", "1")
+    ('mIoU (%)', 'EPE3D (m)', 'SSIM')
+    """
+    shown = "%" if unit == "fraction" else unit
+    return title_of(key) + (f" ({shown})" if shown and shown != "1" else "")

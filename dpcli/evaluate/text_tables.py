@@ -65,6 +65,28 @@ def four_digit_ends(own: Interval | None) -> str:
     return f"{own.low:.4g} - {own.high:.4g}" if own is not None and own.defined else UNDEFINED
 
 
+def number_text(value: float | None, unit: str = "", *, signed: bool = False) -> str:
+    """Returns a number as tables of several metrics have it: `85.1` for a fraction of 0.8512, other units to four digits."""
+    if value is None or np.isnan(value):
+        return UNDEFINED
+    sign = "+" if signed else ""
+    return f"{100 * value:{sign}.1f}" if unit == "fraction" else f"{value:{sign}.4g}"
+
+
+def number_ends(own: Interval, unit: str, *, signed: bool = False) -> str:
+    """Returns the ends of an interval in the form of `number_text`: `83.1 - 87.0`, of a difference `-1.2 to +3.4`."""
+    if not own.defined:
+        return UNDEFINED
+    return (" to " if signed else " - ").join(number_text(end, unit, signed=signed) for end in (own.low, own.high))
+
+
+def p_value_text(value: float | None) -> str:
+    """Returns a p value to three digits, never as certain as 0; `-` for an undefined one."""
+    if value is None or np.isnan(value):
+        return UNDEFINED
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
 def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
     """Returns how the intervals were found, and that they are too narrow where they are of few, or nothing without intervals.
 

@@ -19,12 +19,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dpcli.evaluate.bootstrap import replicates
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
     SegmentationStatistics,
     segmentation_compute,
-    segmentation_merge,
     segmentation_update,
     segmentation_weighted,
 )
@@ -59,7 +59,7 @@ def timed(function: Callable[[], object], repeat: int) -> tuple[float, object]:
 
 def ours(objects: list[list[Frame]]) -> tuple[list[SegmentationStatistics], SegmentationMetrics]:
     found = [segmentation_update(frames) for frames in objects]
-    return found, segmentation_compute(segmentation_merge(found))
+    return found, segmentation_compute(merge_statistics(found))
 
 
 def libraries(objects: list[list[Frame]]) -> tuple[float, float]:
@@ -82,7 +82,7 @@ def merged(found: list[SegmentationStatistics], resamples: int) -> np.ndarray:
     """AP of resamples the plain way."""
     rng = np.random.default_rng(0)
     draws = rng.integers(0, len(found), (resamples, len(found)))
-    return np.array([segmentation_compute(segmentation_merge([found[i] for i in row])).ap for row in draws])
+    return np.array([segmentation_compute(merge_statistics([found[i] for i in row])).ap for row in draws])
 
 
 def main() -> int:

@@ -58,10 +58,10 @@ def write_sources(folder: Path, videos: int) -> dict[str, Path]:
 
 def decode(path: Path) -> int:
     """Frames of one video, decoded as the reader decodes them and dropped."""
-    from dpcli.prepare.decode.depth_files import image_paths, read_image, read_video
+    from dpcli.prepare.decode.depth_files import read_image, read_video
 
     if path.is_dir():
-        return sum(read_image(image) is not None for image in image_paths(path))
+        return sum(read_image(image) is not None for image in sorted(path.iterdir()))
     return len(read_video(path)[0])
 
 

@@ -21,12 +21,13 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video.frame_pass import in_threads
-from dpcli.evaluate.video.picture_statistics import picture_compute, picture_merge
+from dpcli.evaluate.video.picture_statistics import picture_compute
 from dpcli.evaluate.video.protocol import VideoProtocol, score_frame
 from dpcli.evaluate.video.sources.source import Picture
-from dpcli.evaluate.video.ssim import ssim_reference
 from dpcli.runtime.progress import Progress, log
+from tests.support.picture_metrics import ssim_reference
 
 _BLOCK = 25  # frames timed at once
 
@@ -49,7 +50,7 @@ def ours(pair: tuple[np.ndarray, np.ndarray], frames: int, border: str) -> tuple
         (lambda f=f: score_frame(f, Picture(rgba=pair[0]), Picture(rgba=pair[1]), protocol, ("psnr", "ssim")))
         for f in range(frames)
     )
-    found = picture_compute(picture_merge(in_threads(jobs, Progress("bench", None))))
+    found = picture_compute(merge_statistics(in_threads(jobs, Progress("bench", None))))
     return found.psnr, found.ssim
 
 

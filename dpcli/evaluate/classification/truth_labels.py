@@ -45,10 +45,10 @@ def match_labels(scores: ScoresReader, truth: str | Path, split: str | None, int
         _check_classes(scores, truth, clouds.class_names)
     row_of = {name: index for index, name in enumerate(names)}
     unknown = [name for name in scores.names if name not in row_of]
-    counted = counted_split(split, splits)
+    split = counted_split(split, splits)
     scored = set(scores.names)
-    unscored = [name for name, own in zip(names, splits, strict=True) if counted in ("all", own) and name not in scored]
-    _check_names(scores, truth, counted, unknown, [] if intersect else unscored, intersect)
+    unscored = [name for name, own in zip(names, splits, strict=True) if split in ("all", own) and name not in scored]
+    _check_names(scores, truth, split, unknown, [] if intersect else unscored, intersect)
     in_truth = np.array([name in row_of for name in scores.names])
     rows = np.array([row_of.get(name, 0) for name in scores.names], np.int64)
     labels = np.where(in_truth, labels[rows], -1).astype(np.int64)

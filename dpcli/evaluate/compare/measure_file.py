@@ -164,17 +164,17 @@ def _measure_motion(path: Path, source: str, options: EvaluationOptions, asked: 
 def _measure_video(path: Path, source: str, options: EvaluationOptions) -> FileMetrics:
     """Returns the metrics of a video; a view is a sample, since its frames look alike."""
     from dpcli.evaluate.video.comparison import evaluate_video, view_values
-    from dpcli.evaluate.video.protocol import describe_protocol
+    from dpcli.evaluate.video.frechet.variants import feature_variant
+    from dpcli.evaluate.video.protocol import describe_protocol, video_protocol
 
     if options.ignore_below or options.split:
         raise UsageError(f"{source}: a video; --ignore-below and --split are for parts files")
-    report = evaluate_video(
-        path,
-        options.truth,
-        metrics=options.metrics or ("psnr", "ssim"),
-        protocol=options.protocol,
-        intersect=options.intersect,
-    )
+    asked, chosen = options.metrics or ("psnr", "ssim"), video_protocol(options.protocol)
+    if "fvd" in asked and feature_variant(chosen.networks.fvd).aggregation == "pooled":
+        raise UsageError(
+            f"--metrics fvd: protocol {options.protocol} takes it of all views at once, so views can't be compared by it"
+        )
+    report = evaluate_video(path, options.truth, metrics=asked, protocol=chosen, intersect=options.intersect)
     for name, reason in report.missing.items():
         raise DataError(f"{source}: {name} not computed: {reason}")
     values, units = view_values(report)

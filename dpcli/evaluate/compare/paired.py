@@ -135,12 +135,11 @@ def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, inte
     """
     _check_facts(a, b)
     a, b, left_out = _common_samples(a, b, intersect)
-    rng, keys = generator(resampling.seed), list(a.units)
-    ones, found = np.ones((1, len(a.names))), {}
+    rng, keys, found = generator(resampling.seed), list(a.units), {}
     if resampling.resamples and len(a.names) > 1:
         found = replicates(lambda counts: _differences(a, b, counts), len(a.names), rng, resampling.resamples)
-    exact = [{key: float(side.metric(ones)[key][0]) for key in keys} for side in (a, b)]
-    changes = {key: _change(key, a, b, (exact[0][key], exact[1][key]), found.get(key), resampling) for key in keys}
+    ours, theirs = a.values(), b.values()
+    changes = {key: _change(key, a, b, (ours[key], theirs[key]), found.get(key), resampling) for key in keys}
     by = next((key for key in ("accuracy", "miou", "epe3d", *keys) if key in a.per_sample and key in keys), "")
     values = (a.per_sample[by], b.per_sample[by]) if by else (np.zeros(0), np.zeros(0))
     return Paired(

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.draw.sheet import save_figure
-from dpcli.evaluate.compare.number_text import metric_title
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
-from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.metric_titles import metric_title, title_of
 
 _LETTERS_PER_INCH = 12  # of text at 9 points
 

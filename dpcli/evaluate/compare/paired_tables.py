@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dpcli.counted import counted
 from dpcli.evaluate.choices import LOWER_IS_BETTER
-from dpcli.evaluate.compare.number_text import metric_title, number_text, p_value_text, signed_ends
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
+from dpcli.evaluate.metric_titles import metric_title
 from dpcli.evaluate.results import left_out_note
-from dpcli.evaluate.text_tables import TextTable
+from dpcli.evaluate.text_tables import TextTable, number_ends, number_text, p_value_text
 
 _LOWER = " \N{DOWNWARDS ARROW}"  # lower is better
 
@@ -34,7 +34,7 @@ def _change_row(key: str, own: Change) -> list[str]:
         number_text(own.a, own.unit),
         number_text(own.b, own.unit),
         number_text(own.difference, own.unit, signed=True),
-        signed_ends(own.interval, own.unit),
+        number_ends(own.interval, own.unit, signed=True),
         p_value_text(own.p),
         *counts,
         p_value_text(own.wilcoxon_p),

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
-
-import numpy as np
 
 from dpcli.evaluate.choices import LOWER_IS_BETTER
 from dpcli.evaluate.compare.paired import Change, CompareReport
@@ -57,7 +54,7 @@ def _compare_protocol(report: CompareReport, changes: dict[str, Change]) -> dict
 
 def _change_json(change: Change) -> dict[str, Any]:
     numbers = {"a": change.a, "b": change.b, "difference": change.difference, "p": change.p}
-    shown = {key: None if np.isnan(value) else value for key, value in numbers.items()}
+    shown = {key: none_if_nan(value) for key, value in numbers.items()}
     counts = {key: getattr(change, key) for key in ("a_better", "b_better", "ties")}
     wilcoxon = change.wilcoxon_p
     return shown | {
@@ -93,8 +90,8 @@ def runs_json(report: RunsReport) -> dict[str, Any]:
 
 def _spread_json(own: Spread, values: list[float | None]) -> dict[str, Any]:
     return {
-        "mean": None if math.isnan(own.mean) else own.mean,
-        "sd": None if math.isnan(own.sd) else own.sd,
+        "mean": none_if_nan(own.mean),
+        "sd": none_if_nan(own.sd),
         "n": len(values),
         "interval": [own.interval.low, own.interval.high] if own.interval.defined else None,
         "values": values,

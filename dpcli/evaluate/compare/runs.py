@@ -19,6 +19,7 @@ from dpcli.evaluate.video.sources.open_source import is_media
 from dpcli.store.file import is_hdf5
 from dpcli.text_files import parse_json, read_text
 
+_OPTIONAL = {"samples": dict, "denominators": dict, "notes": list}
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
 
 
@@ -109,8 +110,14 @@ def evaluate_runs(
         _check_same_experiment(runs[0], run)
     runs = _distinct_titles(runs)
     samples = runs[0].identity.get("samples") or {}
+    number = samples.get("number")
     return RunsReport(
-        runs[0].task, runs, runs[0].units, confidence, str(samples.get("kind", "")), int(samples.get("number", 0))
+        runs[0].task,
+        runs,
+        runs[0].units,
+        confidence,
+        str(samples.get("kind", "")),
+        number if isinstance(number, int) else 0,
     )
 
 
@@ -152,6 +159,9 @@ def _json_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]
 def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
     if not isinstance(own, dict) or not all(isinstance(own.get(key), dict) for key in ("metrics", "units", "protocol")):
         raise DataError(f"{source}: not an object of `dpc evaluate ... --json` (no metrics, units and protocol)")
+    wrong = [key for key, kind in _OPTIONAL.items() if not isinstance(own.get(key) or kind(), kind)]
+    if wrong:
+        raise DataError(f"{source}: {wrong[0]} is a {type(own[wrong[0]]).__name__}; evaluate again")
     metrics = {key: own["metrics"][key] for key in own["units"] if _is_number(own["metrics"].get(key, ""))}
     missing = [key for key in asked or () if key not in metrics]
     if missing:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dpcli.counted import counted
-from dpcli.evaluate.compare.number_text import metric_title, number_text, plain_ends
 from dpcli.evaluate.compare.runs import RunsReport
-from dpcli.evaluate.text_tables import TextTable
+from dpcli.evaluate.metric_titles import metric_title
+from dpcli.evaluate.text_tables import TextTable, number_ends, number_text
 
 
 def runs_tables(report: RunsReport) -> list[TextTable]:
@@ -17,7 +17,10 @@ def runs_tables(report: RunsReport) -> list[TextTable]:
     rows += [
         [f"mean of {len(report.runs)}", *(number_text(spreads[key].mean, units[key]) for key in keys)],
         ["± sd", *(number_text(spreads[key].sd, units[key]) for key in keys)],
-        [f"{100 * report.confidence:.4g} % interval", *(plain_ends(spreads[key].interval, units[key]) for key in keys)],
+        [
+            f"{100 * report.confidence:.4g} % interval",
+            *(number_ends(spreads[key].interval, units[key]) for key in keys),
+        ],
     ]
     return [TextTable(f"{report.task.capitalize()} of {counted(len(report.runs), 'run')}", header, rows)]
 

@@ -59,7 +59,7 @@ def joint_statistics(
     """
     name = _true_names(true_part, part)
     seen = set(np.unique(true_part[true_part >= 0]).tolist())
-    true_edges = {edge: child for edge, child in _edges(true_joint, {k: k for k in seen}).items() if edge <= seen}
+    true_edges = _edges(true_joint, {k: k for k in seen})
     edges = _edges(joint, name)
     present = set(np.unique(part[part >= 0]).tolist())
     predicted = sum(joint[0, k, PARENT] >= 0 for k in present)

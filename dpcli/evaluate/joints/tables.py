@@ -17,6 +17,7 @@ from dpcli.evaluate.results import (
     none_if_nan,
     samples_json,
 )
+from dpcli.evaluate.segmentation.part_matching import IOU_THRESHOLD
 from dpcli.evaluate.segmentation.tables import class_rows, interval_tables
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
 
@@ -97,7 +98,7 @@ def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()
         "protocol": {
             "split": report.split,
             "truth": report.truth,
-            "iou_threshold": 0.5,
+            "iou_threshold": IOU_THRESHOLD,
             "axis_within": 5,
             "visible": VISIBLE,
         },

@@ -10,7 +10,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.networks import full_precision
 from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
-from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
+from dpcli.evaluate.networks.weights import whole_weights
 
 VARIANTS = {"openai": "clip-openai", "laion": "clip-laion"}
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -33,11 +33,7 @@ class Clip:
         """
         if variant not in VARIANTS:
             raise UsageError(f"CLIP variant {variant!r}: expected one of {', '.join(VARIANTS)}")
-        weights, path = weights_named(VARIANTS[variant]), find_weights(VARIANTS[variant], folder)
-        found = check_file(path, weights, digest=False)
-        if found.state != "present":
-            raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
-        return cls.open(path.parent, device)
+        return cls.open(whole_weights(VARIANTS[variant], folder).parent, device)
 
     @classmethod
     def open(cls, folder: Path, device: str = "cpu") -> Clip:

@@ -177,11 +177,11 @@ class FidInception(nn.Module):
         return x.mean(dim=(2, 3))
 
 
-def inception_input(picture: torch.Tensor, antialias: bool = True) -> torch.Tensor:
+def inception_input(picture: torch.Tensor) -> torch.Tensor:
     """Returns pictures (B,3,H,W) of 0..255 as f32 (B,3,299,299), (x - 128) / 128, as torchmetrics makes them.
 
-    Bilinear, align_corners False; antialias False as pytorch-fid, which scales by x / 127.5 - 1 instead.
+    Bilinear with antialias, where pytorch-fid takes none and scales by x / 127.5 - 1.
     """
     size = (SIDE, SIDE)
-    x = F.interpolate(picture.float(), size=size, mode="bilinear", align_corners=False, antialias=antialias)
+    x = F.interpolate(picture.float(), size=size, mode="bilinear", align_corners=False, antialias=True)
     return (x - 128) / 128

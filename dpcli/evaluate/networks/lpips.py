@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks import full_precision
 from dpcli.evaluate.networks.lpips_trunks import alexnet, squeezenet, vgg16
-from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
-from dpcli.evaluate.networks.weights import find_weights
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
+from dpcli.evaluate.networks.weights import whole_weights
 
 HEADS = Path(__file__).parent / "heads"  # the linear weights, BSD-2, see LPIPS.md there
 NETS = {"alex": (alexnet, "alexnet"), "vgg": (vgg16, "vgg16"), "squeeze": (squeezenet, "squeezenet")}
@@ -43,8 +42,8 @@ class Lpips(nn.Module):
     def load(cls, net: str, folder: Path) -> Lpips:
         """Loads the published trunk from the weights folder. Raises DataError when absent, damaged or another network's."""
         made = cls(net)
-        name = NETS[net][1]
-        fill_module(made.trunk, load_weights(name, folder), find_weights(name, folder))
+        path = whole_weights(NETS[net][1], folder)
+        fill_module(made.trunk, load_tensors(path), path)
         return made
 
     @torch.no_grad()
@@ -53,36 +52,20 @@ class Lpips(nn.Module):
         a: Tensor,  # [B, 3, H, W]
         b: Tensor,  # [B, 3, H, W]
         *,
-        spatial: bool = False,
         range01_mistake: bool = False,
-    ) -> Tensor:  # [B], or [B, H, W] when spatial
-        """Returns LPIPS of pairs of RGB pictures in 0..1.
+    ) -> Tensor:  # [B]
+        """Returns LPIPS of pairs of RGB pictures in 0..1: over the layers the sum of their maps' means.
 
-        spatial: a map of the pictures' size (each layer's, bilinear) instead of the sum of the layers' means.
         range01_mistake: DisCo's evaluation gives the network 0..1 where it expects -1..1; for its published numbers.
         Raises DataError for values that are not finite or not in 0..1, and for pictures under the trunk's `smallest`.
         """
-        maps = self.layer_maps(a, b, range01_mistake=range01_mistake)
-        if not spatial:
-            return sum(each.mean((1, 2)) for each in maps)
-        sized = (F.interpolate(each[:, None], a.shape[2:], mode="bilinear", align_corners=False) for each in maps)
-        return sum(sized)[:, 0]
-
-    @torch.no_grad()
-    def layer_maps(
-        self,
-        a: Tensor,  # [B, 3, H, W]
-        b: Tensor,  # [B, 3, H, W]
-        *,
-        range01_mistake: bool = False,
-    ) -> list[Tensor]:  # of [B, h, w]
-        """Returns each layer's share of the distance, pixel by pixel; arguments and errors as `distance`."""
         if a.shape != b.shape:
             raise ValueError(f"pictures of shapes {tuple(a.shape)} and {tuple(b.shape)}; expected equal ones")
         features = [self.feature_maps(x, range01_mistake=range01_mistake) for x in (a, b)]
-        return [
-            ((_unit(x) - _unit(y)).square_() * head).sum(1) for x, y, head in zip(*features, self.heads, strict=True)
-        ]
+        return sum(
+            ((_unit(x) - _unit(y)).square_() * head).sum(1).mean((1, 2))
+            for x, y, head in zip(*features, self.heads, strict=True)
+        )
 
     @torch.no_grad()
     def feature_maps(

@@ -7,32 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dpcli.errors import DataError
-from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
 from dpcli.runtime.torch_files import load_plain
 
 if TYPE_CHECKING:
     import torch
 
 
-def load_weights(name: str, folder: Path) -> dict[str, torch.Tensor]:
-    """Returns the state dict of the weights `name`. Raises DataError when absent, damaged, or not a plain state dict.
-
-    The size is compared, and the digest of a TorchScript archive, which holds code.
-    """
-    weights, path = weights_named(name), find_weights(name, folder)
-    found = check_file(path, weights, digest=weights.script)
-    if found.state != "present":
-        raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
-    return load_tensors(path, script=weights.script)
-
-
-def load_tensors(path: Path, script: bool = False) -> dict[str, torch.Tensor]:
+def load_tensors(path: Path) -> dict[str, torch.Tensor]:
     """Returns the tensors of a .safetensors, .pth, .pt or .bin file by name, on the CPU; nothing else is unpickled.
 
     A training checkpoint's `state_dict` is taken, and the prefix `module.` of parallel training dropped.
-    script: the file is a TorchScript archive. Raises DataError for anything else, and for weights that are not finite.
+    Raises DataError for anything else, and for weights that are not finite.
     """
-    state = _tensors(_read(path, script))
+    state = _tensors(_read(path))
     if state is None:
         raise DataError(f"{path}: not a plain state dict; expected tensors by name")
     bad = next((name for name, value in state.items() if not value.isfinite().all()), None)
@@ -41,9 +28,7 @@ def load_tensors(path: Path, script: bool = False) -> dict[str, torch.Tensor]:
     return state
 
 
-def _read(path: Path, script: bool) -> Any:
-    import torch
-
+def _read(path: Path) -> Any:
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -51,8 +36,6 @@ def _read(path: Path, script: bool) -> Any:
             return load_file(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about old formats, which published files have
-            if script:
-                return torch.jit.load(str(path), map_location="cpu").state_dict()
             return load_plain(path)
     except DataError:
         raise

@@ -106,15 +106,10 @@ def find_weights(name: str, folder: Path) -> Path:
 
 def how_to_get(weights: Weights, missing: Weights, folder: Path) -> str:
     """Returns what to do about a missing file, in half a line."""
-    by_hand = f"download {missing.url} ({size_text(missing)}) to {folder / missing.file}"
+    by_hand = f"download {missing.url} ({bytes_text(missing.size, missing.about)}) to {folder / missing.file}"
     if weights.by_hand:
         return f"{by_hand} (from that page, by hand)"
     return f"run `dpc evaluate weights fetch {weights.name}`, or {by_hand}"
-
-
-def size_text(weights: Weights) -> str:
-    """Returns the size of one file in words; the sum with those beside it is the caller's."""
-    return bytes_text(weights.size, weights.about)
 
 
 def bytes_text(count: int, about: bool = False) -> str:
@@ -160,6 +155,18 @@ def _check_digest(found: str, weights: Weights) -> Checked:
     return Checked(
         "present", found, "whole SHA-256 checked" if whole else f"first 8 digits of SHA-256 checked: {found}"
     )
+
+
+def whole_weights(name: str, folder: Path, *, digest: bool = False) -> Path:
+    """Returns where the weights `name` lie, after their size, and with `digest` their SHA-256, was compared.
+
+    Raises DataError when they are absent, as `find_weights`, or damaged.
+    """
+    path = find_weights(name, folder)
+    found = check_file(path, weights_named(name), digest)
+    if found.state != "present":
+        raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
+    return path
 
 
 def check_weights(weights: Weights, folder: Path, digest: bool = True) -> Checked:

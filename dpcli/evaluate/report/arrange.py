@@ -71,6 +71,12 @@ def _section(number: int, result: CollectedResult, title: str) -> Section:
     if truth.suffix or len(truth.parts) > 1:  # a path, not words
         data = f"{data} of {truth.name}" if data else truth.name
     remarks = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
+    accepted = found.get("accepted")
+    if isinstance(accepted, Mapping):
+        remarks.append(
+            f"Something was recognized in {accepted.get('samples')} samples, of which {accepted.get('correct')} are right; the tables"
+            " count the others as scored."
+        )
     left_out = [
         f"Left out, {own.get('reason', 'unknown')}: {own.get('count', len(own.get('names', [])))}."
         for own in found.get("left_out", [])

@@ -44,12 +44,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Headline:
-    """Holds the one number a result is known by: metric, value and interval as text, what it is a share or mean of."""
+    """Holds the one number a result is known by: metric, value and interval as text."""
 
     metric: str
     value: Cell
     interval: str = ""
-    of: str = ""
 
 
 @dataclass

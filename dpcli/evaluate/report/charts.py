@@ -17,11 +17,11 @@ _DEEP = 0.55  # share from which a cell's text is drawn light
 _ON_PAPER = 18  # classes of a confusion matrix; more are printed smaller
 
 
-def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str:
+def histogram(values: Sequence[float], unit: str = "") -> str:
     """Returns a histogram of values as SVG, with their median marked; fractions over 0..1, others over their own range."""
     data = np.asarray(values, np.float64)
     low, high = (0.0, 1.0) if unit == "fraction" and data.min() >= 0 and data.max() <= 1 else (data.min(), data.max())
-    counts, edges = np.histogram(data, bins, (low, high if high > low else low + 1))
+    counts, edges = np.histogram(data, _BINS, (low, high if high > low else low + 1))
     most, median = int(counts.max()), float(np.median(data))
     place = _scale(edges[0], edges[-1])
     bars = "".join(

@@ -13,6 +13,7 @@ from dpcli.evaluate.report.blocks import Figure, Table
 from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.evaluate.results import KEPT_STATISTICS
+from dpcli.evaluate.video.sources.open_source import is_media
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.file import MAGIC, is_hdf5
 from dpcli.store.pipes import standard_input
@@ -22,7 +23,9 @@ _EXPECTED = (
     "expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
     "or a video as PRED=TRUTH"
 )
-_MAPPINGS, _LISTS = ("metrics", "protocol", "units", "denominators", "intervals"), ("left_out", "provenance")
+_MAPPINGS = ("metrics", "protocol", "units", "denominators", "intervals", "surface_intervals")
+_LISTS = ("left_out", "provenance")
+_INSIDE = {"per_class": list, "thresholds": list, "streams": dict}  # of `metrics`, where they are
 _VIDEO = ("views", "gaussians")
 
 
@@ -72,7 +75,7 @@ def _results_of(
     if argument == "-":
         return _parse_objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _split_pair(argument)
-    if path.is_file() and not is_hdf5(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
+    if path.is_file() and own is None and not is_hdf5(path) and not is_media(path):
         return _parse_objects(path.read_bytes(), str(path), pictures)
     kind = file_kind(path) if path.is_file() and is_hdf5(path) else "video"
     if kind == "scores":
@@ -167,6 +170,14 @@ def _check_result(found: Any, where: str) -> dict[str, Any]:
         entries = found.get(key, [])
         if not isinstance(entries, list) or not all(isinstance(own, dict) for own in entries):
             raise DataError(f"{where}: {key} is not a list of objects; print the result again")
+    lists = [("notes", found), *(("names", entry) for entry in found.get("left_out", []))]
+    parts = [
+        *((key, found.get("metrics", {}), kind) for key, kind in _INSIDE.items()),
+        *((*own, list) for own in lists),
+    ]
+    for key, own, kind in parts:
+        if not isinstance(own.get(key, kind()), kind):
+            raise DataError(f"{where}: {key} is a {type(own[key]).__name__}; print the result again")
     return found
 
 

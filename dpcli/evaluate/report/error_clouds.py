@@ -28,9 +28,12 @@ _ROWS = 200  # sequences listed
 
 @dataclass(frozen=True)
 class SequenceError:
-    """Holds one sequence: mIoU of each frame f64 (F), NaN where no part is true; end-point errors f64 (pairs), of means."""
+    """Holds one sequence: mIoU of each frame f64 (F), NaN where no part is true; end-point errors f64 (pairs), of means.
 
-    row: tuple[int, int]
+    place: among the paired sequences.
+    """
+
+    place: int
     name: str
     iou: np.ndarray
     epe: np.ndarray
@@ -43,26 +46,27 @@ class SequenceError:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Holds what is drawn of a frame: points f32 (N,3), true and predicted part i (N), error f64 (N) >= 0 (NaN = unknown)."""
+    """Holds what is drawn of a frame: points f32 (N,3), true and predicted part i (N), error f64 (N) >= 0 (NaN = unknown).
+
+    unit: of the end-point errors, None where an error of 1 is a wrong part.
+    """
 
     points: np.ndarray
     truth: np.ndarray
     part: np.ndarray
     error: np.ndarray
-    unit: str
+    unit: str | None
 
 
 def part_blocks(path: Path, truth: Path, *, split: str | None = None, motion: bool = False) -> list[Table | Figure]:
     """Returns how errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
     fields = ("part", "pose") if motion else ("part",)
     with PairedSequences(path, truth, split=split, fields=fields) as paired:
-        errors = [_sequence_error(row, paired.pair(place), motion) for place, row in enumerate(paired.rows)]
+        errors = [_sequence_error(place, paired.pair(place), motion) for place in range(len(paired.rows))]
         known = [own for own in errors if not np.isnan(own.mean)]
         shown = _choose_sequences(known)
         unit = paired.truth.length_unit
-        clouds = [
-            (title, own, frame, _read_cloud(paired, own, frame, unit if motion else "")) for title, own, frame in shown
-        ]
+        clouds = [(title, own, frame, _read_cloud(paired, own, frame)) for title, own, frame in shown]
     return [
         *_error_histograms(known, unit),
         _sequence_table(known, unit),
@@ -70,7 +74,7 @@ def part_blocks(path: Path, truth: Path, *, split: str | None = None, motion: bo
     ]
 
 
-def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> SequenceError:
+def _sequence_error(place: int, pair: SequencePair, motion: bool) -> SequenceError:
     offsets, truth, predicted = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
     ious = [mean_iou(truth[span], predicted[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
@@ -78,7 +82,7 @@ def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> S
     if motion:
         for (source, target), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
             errors.append(mean_defined(_flow_error(pair, source, target, flow)))
-    return SequenceError(row, pair.truth.name, np.array(ious), np.array(errors))
+    return SequenceError(place, pair.truth.name, np.array(ious), np.array(errors))
 
 
 def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) -> np.ndarray:
@@ -98,22 +102,20 @@ def _choose_sequences(errors: Sequence[SequenceError]) -> list[tuple[str, Sequen
     return [(title, own, int(np.nanargmin(np.abs(own.iou - own.mean)))) for title, own in picked]
 
 
-def _read_cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -> Cloud:
-    """Returns a frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly."""
-    ours, theirs = own.row
-    truth = paired.truth.read(theirs, fields=paired.fields)
-    predicted = paired.predicted.read(ours, fields=("part",))
-    pair = SequencePair(truth, predicted, paired.predicted.read_parts(ours))
+def _read_cloud(paired: PairedSequences, own: SequenceError, frame: int) -> Cloud:
+    """Returns a frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly.
+
+    Where poses are read and a pair begins at the frame, the error is that of its flow.
+    """
+    pair = paired.pair(own.place)
+    truth, unit = pair.truth, None
     span = slice(int(truth.frame_offsets[frame]), int(truth.frame_offsets[frame + 1]))
-    part = _rename_parts(truth.part[span], predicted.part[span])
+    part = _rename_parts(truth.part[span], pair.predicted.part[span])
     error = np.where(truth.part[span] >= 0, (part != truth.part[span]).astype(np.float64), np.nan)
-    if unit or "pose" in paired.fields:
-        from_frame = [row for row, source in enumerate(pair.parts.pairs[:, 0].tolist()) if source == frame]
-        if from_frame:
-            row = from_frame[0]
-            error = _flow_error(pair, *pair.parts.pairs[row].tolist(), pair.parts.flow[row])
-        else:
-            unit = ""
+    from_frame = np.flatnonzero(pair.parts.pairs[:, 0] == frame)
+    if "pose" in paired.fields and len(from_frame):
+        row, unit = from_frame[0], paired.truth.length_unit
+        error = _flow_error(pair, *pair.parts.pairs[row].tolist(), pair.parts.flow[row])
     keep = spread_evenly(len(error), _MOST_POINTS)
     return Cloud(truth.points[span][keep], truth.part[span][keep], part[keep], error[keep], unit)
 
@@ -177,7 +179,8 @@ def _clouds_figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figur
 
 def _markup(title: str, own: SequenceError, frame: int, cloud: Cloud) -> str:
     top = float(np.nanmax(cloud.error)) if np.isfinite(cloud.error).any() else 0.0
-    words = f"red: end-point error up to {text_of(top)} {cloud.unit}".rstrip() if cloud.unit else "red: wrong part"
+    motion = cloud.unit is not None
+    words = f"red: end-point error up to {text_of(top)} {cloud.unit}".rstrip() if motion else "red: wrong part"
     caption = f"{title}: {own.name}, frame {frame}, mIoU {text_of(float(own.iou[frame]), 'fraction')}"
     data = base64.b64encode(pack_cloud(cloud)).decode("ascii")
     return (

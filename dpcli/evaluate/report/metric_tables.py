@@ -22,7 +22,7 @@ from dpcli.evaluate.report.blocks import (
 from dpcli.evaluate.report.charts import curve, histogram
 
 _HEADLINES = ("accuracy", "ap", "epe3d", "psnr", "lpips", "fvd", "miou", "ssim", "adjusted_rand_index")
-_COUNTS = ("samples", "sequences", "views", "frames", "pairs", "n", "runs")
+_COUNTS = ("samples", "sequences", "recordings", "views", "frames", "pairs", "n", "runs")
 _UNITLESS = ("p", "p_value", "wilcoxon_p", "n", "count", "wins", "losses", "ties", "label", "frame", "seed")
 _SPREAD_OF = ("per_sequence", "per_frame", "per_sample", "per_video", "per_object")
 _LONGEST_CURVE = 400
@@ -30,13 +30,13 @@ _LONGEST_CURVE = 400
 
 def headline(found: Mapping[str, Any]) -> Headline:
     """Returns the metric a result is known by: the first of the usual ones, else a difference or mean, else its first number."""
-    metrics, units, of = found.get("metrics", {}), found.get("units", {}), denominator(found)
+    metrics, units = found.get("metrics", {}), found.get("units", {})
     plain = {key: value for key, value in metrics.items() if is_number(value)}
     for key in (*_HEADLINES, *plain):
         if key in plain:
             unit = _unit_of(units, key)
             ends = metrics.get(f"{key}_interval") or intervals_of(found).get(key)
-            return Headline(_with_unit(key, unit), cell(plain[key], unit), interval_text(ends, unit), of)
+            return Headline(_with_unit(key, unit), cell(plain[key], unit), interval_text(ends, unit))
     for key, record in metrics.items():
         for name in ("difference", "mean"):
             if isinstance(record, Mapping) and is_number(record.get(name)):
@@ -45,16 +45,15 @@ def headline(found: Mapping[str, Any]) -> Headline:
                     f"{name} of {_with_unit(key, unit)}",
                     cell(record[name], unit),
                     interval_text(record.get("interval"), unit),
-                    of,
                 )
-    return Headline("-", Cell("-"), "", of)
+    return Headline("-", Cell("-"))
 
 
 def denominator(found: Mapping[str, Any]) -> str:
     """Returns the first counts of the object, in words.
 
-    >>> denominator({"denominators": {"samples": 231, "classes": 20}})
-    '231 samples'
+    >>> denominator({"denominators": {"samples": 231, "classes": 20}}), denominator({"denominators": {"recordings": 2, "frames": 50}})
+    ('231 samples', '2 recordings, 50 frames')
     """
     counts = found.get("denominators", {})
     for own in [own for own in counts.values() if isinstance(own, Mapping)]:  # of a comparison: by what is compared
@@ -96,19 +95,28 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
 
 
 def intervals_of(found: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Returns [low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found."""
-    own = found.get("intervals", {})
-    return own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
+    """Returns [low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found.
+
+    Those of a scene's surface, of which frames are resampled, have a place of their own.
+    """
+    own, surface = found.get("intervals", {}), found.get("surface_intervals", {}).get("metrics")
+    own = own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
+    return {**surface, **own} if isinstance(surface, Mapping) else own
 
 
 def _interval_note(found: Mapping[str, Any]) -> str:
-    """Returns how the intervals were found, in a sentence; "" without any."""
-    own = found.get("intervals", {})
+    """Returns how the intervals were found, in sentences; "" without any."""
+    how, of_surface = (_how_resampled(found.get(key, {})) for key in ("intervals", "surface_intervals"))
+    wilson = how and "accuracy_interval" in found.get("metrics", {})
+    said = ((how, "Intervals: "), ("Wilson" if wilson else "", "Of accuracy: "), (of_surface, "Of the surface: "))
+    return " ".join(f"{opening}{words}." for words, opening in said if words)
+
+
+def _how_resampled(own: Mapping[str, Any]) -> str:
     if not own.get("resamples") or not is_number(own.get("confidence")):
         return ""
     of = f"{own.get('number', '')} {own.get('resampled', '')}".strip()
-    how = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
-    return f"Intervals: {how}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
+    return f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
 
 
 def _grouped_metrics(metrics: Mapping[str, Any]) -> dict[str, Mapping]:

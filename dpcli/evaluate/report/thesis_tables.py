@@ -14,21 +14,7 @@ from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.report.blocks import Cell, Table, is_number, table
 from dpcli.text_files import read_toml
 
-_FACTOR = {("fraction", "percent"): 100.0, ("", "1/100 length unit"): 100.0}
 _WORDS = {"percent": "%", "1": "", "1/100 length unit": "\u00d7100"}
-
-
-@dataclass(frozen=True)
-class ThesisRow:
-    """Holds one number of the thesis. own: of a method of the thesis, not of one it compares with."""
-
-    table: str
-    method: str
-    setting: str
-    metric: str
-    value: float
-    unit: str
-    own: bool
 
 
 @dataclass(frozen=True)
@@ -52,15 +38,6 @@ class ThesisTable:
     def id(self) -> str:
         """Returns the name by which `--beside` asks for the table, such as table-3.4."""
         return f"table-{self.number}"
-
-    def numbers(self) -> list[ThesisRow]:
-        """Returns every number of the table."""
-        return [
-            ThesisRow(self.number, row["method"], row["setting"], metric, float(value), unit, row.get("own", False))
-            for row in self.rows
-            for metric, unit, value in zip(self.metrics, self.units, row["values"], strict=True)
-            if is_number(value)
-        ]
 
     def knows(self, found: Mapping[str, Any]) -> bool:
         """Returns whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
@@ -182,7 +159,7 @@ def _digits(thesis: ThesisTable, place: int) -> int:
 def _convert(value: Any, ours: str, theirs: str, digits: int) -> Cell:
     if not is_number(value):
         return Cell("-")
-    factor = _FACTOR.get((ours, theirs), 100.0 if theirs.startswith("1/100") else 1.0)
+    factor = 100.0 if (ours, theirs) == ("fraction", "percent") or theirs.startswith("1/100") else 1.0
     return Cell(f"{value * factor:.{digits}f}", value * factor)
 
 

@@ -6,7 +6,7 @@ take panoptic quality, F1, precision and recall from `part_scores`, and average 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,6 @@ from dpcli.evaluate.segmentation.part_matching import FrameMatch, match_parts, m
 from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index, rand_index
 
 _RELEASE_FLOOR = 1e-10  # of the published denominators
-Ratio = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,6 @@ class SegmentationStatistics:
     skipped: int
     dropped: int
     unknown: int
-
-    def __add__(self, other: SegmentationStatistics) -> SegmentationStatistics:
-        """Returns the statistics of both sets of objects together."""
-        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)
@@ -127,19 +122,6 @@ def _is_release(protocol: str) -> bool:
     return protocol == "release"
 
 
-def panoptic_quality(
-    iou_sum: np.ndarray, predictions: np.ndarray, truth_parts: np.ndarray, ratio: Ratio = divide
-) -> np.ndarray:
-    """Returns PQ: the sum of the found parts' IoU over the mean number of predictions and true parts (Kirillov et al. 2019).
-
-    All arguments are numbers or arrays of one shape. ratio: how to divide, and what 0/0 is.
-
-    >>> float(panoptic_quality(0.8 + 0.9, 3, 2))
-    0.68
-    """
-    return ratio(iou_sum, (predictions + truth_parts) / 2)
-
-
 def part_scores(
     true_positives: np.ndarray,
     predictions: np.ndarray,
@@ -149,6 +131,7 @@ def part_scores(
 ) -> dict[str, np.ndarray]:
     """Returns PQ, F1, precision and recall from counts, which are numbers or arrays of one shape.
 
+    PQ: the sum of the found parts' IoU over the mean number of predictions and true parts (Kirillov et al. 2019).
     F1 = 2 TP / (predictions + true parts). Protocol `release` takes F1 from precision and recall, and 0/0 as 0.
 
     >>> {key: round(float(value), 3) for key, value in part_scores(2, 3, 1.7, 2).items()}
@@ -158,7 +141,7 @@ def part_scores(
     ratio = _floored_ratio if release else divide
     precision, recall = ratio(true_positives, predictions), ratio(true_positives, truth_parts)
     return {
-        "pq": panoptic_quality(iou_sum, predictions, truth_parts, ratio),
+        "pq": ratio(iou_sum, (predictions + truth_parts) / 2),
         "f1": ratio(2 * precision * recall, precision + recall)
         if release
         else ratio(2 * true_positives, predictions + truth_parts),

@@ -48,10 +48,6 @@ class MotionStatistics:
     unmatched: int = 0
     unknown: int = 0
 
-    def __add__(self, other: MotionStatistics) -> MotionStatistics:
-        """Returns the statistics of both sets of pairs together."""
-        return merge_statistics([self, other])
-
 
 @dataclass(frozen=True)
 class FlowShares:
@@ -82,19 +78,6 @@ class MotionMetrics:
     unknown: int
 
 
-def end_point_errors(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Returns the end-point error (EPE) of each point, f64 (N): the distance of predicted and true flow f (N,3).
-
-    In length units. Raises DataError on other shapes.
-
-    >>> end_point_errors(np.array([[1.0, 0, 0]]), np.array([[1.0, 3, 4]])).tolist()
-    [5.0]
-    """
-    if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 3:
-        raise DataError(f"flow {predicted.shape} and true flow {truth.shape}: expected (points, 3) twice")
-    return np.linalg.norm(predicted - truth.astype(np.float64), axis=1)
-
-
 def flow_update(predicted: np.ndarray, truth: np.ndarray, meters: float = 1.0) -> MotionStatistics:
     """Returns the statistics of one frame pair from predicted and true flow f (N,3) in length units of so many meters.
 
@@ -105,7 +88,10 @@ def flow_update(predicted: np.ndarray, truth: np.ndarray, meters: float = 1.0) -
     >>> found.epe3d, found.shares[0.05].accs, found.shares[0.05].accr, found.shares[0.05].outlier
     (0.5, 0.5, 0.5, 0.5)
     """
-    error, length = end_point_errors(predicted, truth), np.linalg.norm(truth.astype(np.float64), axis=1)
+    if predicted.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 3:
+        raise DataError(f"flow {predicted.shape} and true flow {truth.shape}: expected (points, 3) twice")
+    truth = truth.astype(np.float64)
+    error, length = np.linalg.norm(predicted - truth, axis=1), np.linalg.norm(truth, axis=1)
     relative = error / (length + _TINY)
     hits = [_threshold_hits(error * meters, relative, tau) for tau in TAUS]
     none = np.zeros(0)

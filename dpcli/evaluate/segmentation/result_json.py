@@ -13,11 +13,12 @@ from dpcli.evaluate.results import class_rows_json, intervals_json, left_out_jso
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics, tau_unit
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
+from dpcli.evaluate.segmentation.part_matching import IOU_THRESHOLD
 from dpcli.evaluate.segmentation.protocol import FIXES, SegmentationReport
 
 
 def segmentation_scores(metrics: SegmentationMetrics) -> dict[str, float | None]:
-    """Returns the seven scores by name, in [0, 1]; None = undefined."""
+    """Returns the scores by name, in [0, 1]; None = undefined."""
     return {key: none_if_nan(getattr(metrics, key)) for key in SEGMENTATION_METRICS}
 
 
@@ -34,7 +35,7 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
             "name": report.protocol,
             "split": report.split,
             "truth": report.truth,
-            "iou_threshold": 0.5,
+            "iou_threshold": IOU_THRESHOLD,
             "ignore_below": report.ignore_below,
             "fixes": list(FIXES) if report.protocol == "dpc" else [],
             "ap_pq_f1_pre_rec": "pooled over all frames of all sequences",

@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling, means_of_samples
-from dpcli.evaluate.choices import LEARNED_METRICS, PICTURE_METRICS, SCENE_METRICS
+from dpcli.evaluate.choices import LEARNED_METRICS, PICTURE_METRICS, PICTURE_UNITS, SCENE_METRICS
 from dpcli.evaluate.networks.weights import weights_folder
 from dpcli.evaluate.proportions import mean_defined
 from dpcli.evaluate.results import LeftOut
@@ -137,11 +137,12 @@ def _learned_scores(
         return {}, {}
     made, missing = load_metrics(names, frames.protocol.networks, folder, device)
     others = replace(frames.protocol, views=frames.protocol.learned_views or frames.protocol.views)
-    second = replace(frames, left_out=[])
+    second = replace(frames, left_out=[], hollow=0)
     if made:
         pairs = match_views(frames.predicted, frames.truth, others, frames.intersect, second.left_out)
         second.feed(pairs, made, missing)
-    frames.size = second.size
+    frames.size, frames.misnumbered, frames.swapped = second.size, second.misnumbered, second.swapped
+    frames.hollow = frames.hollow or second.hollow
     frames.left_out.extend(entry for entry in second.left_out if entry not in frames.left_out)  # each is said once
     scores = {}
     for name, metric in made.items():
@@ -157,7 +158,7 @@ def view_values(report: VideoReport) -> tuple[dict[str, dict[str, float]], dict[
     """Returns {view: {metric: value}} of the metrics whose value is the mean over views, and each one's unit."""
     pictured = [name for name in report.names if name in PICTURE_METRICS]
     values = {view.title: {name: getattr(view.metrics, name) for name in pictured} for view in report.views}
-    units = {name: "dB" if name.startswith("psnr") else "1" for name in pictured}
+    units = {name: PICTURE_UNITS[name] for name in pictured}
     for name, score in report.learned.items():
         for view, value in score.per_view.items():
             values.setdefault(view, {})[name] = value

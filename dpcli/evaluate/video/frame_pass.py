@@ -81,11 +81,13 @@ class FramePass:
             for ours, theirs, count in counts:
                 self._call_each(metrics, missing, "start", self.truth.views[theirs].title)
                 for frame, predicted, truth in self._finite_frames(ours, theirs, count, damaged):
+                    self._look_for_mistakes(predicted, truth, f"view {self.truth.views[theirs].title!r}, frame {frame}")
                     pair = (scaled(picture, self.protocol) for picture in (predicted, truth))
                     self._call_each(metrics, missing, "add", *pair, frame)
                     progress.advance()
                 self._call_each(metrics, missing, "end")
         self._refuse_damaged(damaged)
+        self._refuse_dim()
 
     @staticmethod
     def _call_each(metrics: dict[str, LearnedMetric], missing: dict[str, str], verb: str, *given: Any) -> None:
@@ -155,6 +157,7 @@ class FramePass:
         """Yields a function that scores a frame for each frame; pictures are read as they are needed."""
         view = self.truth.views[theirs]
         for frame, predicted, truth in self._finite_frames(ours, theirs, count, damaged, self.watch):
+            check_size(truth.size, self.protocol, self.metrics, str(self.truth.path))
             self._look_for_mistakes(predicted, truth, f"view {view.title!r}, frame {frame}")
             yield lambda f=frame, p=predicted, t=truth: score_frame(f, p, t, self.protocol, self.metrics)
 
@@ -184,8 +187,6 @@ class FramePass:
                 f"{self.predicted.path}: {where} is {ours}, but {theirs} in {self.truth.path}; render or resize "
                 "to that size, or --protocol consistent4d resizes both"
             )
-        if self.size == (0, 0):
-            check_size(truth.size, self.protocol, self.metrics, str(self.truth.path))
         self.size = truth.size
 
     def _look_for_mistakes(self, predicted: Picture, truth: Picture, where: str) -> None:
@@ -203,15 +204,18 @@ class FramePass:
     def _check_plausible(self, scores: list[ViewScore], counts: list) -> None:
         if not scores and counts:
             raise DataError(f"{self.predicted.path}: every frame has NaN or infinite pixels; nothing to compare")
-        if self.brightest[0] == 1 < self.brightest[1]:
-            raise DataError(
-                f"{self.predicted.path}: 8-bit pictures with no value above 1; colors in 0..1 were saved without "
-                "multiplying by 255"
-            )
+        self._refuse_dim()
         if "psnr_foreground" in self.metrics and scores and not any(score.metrics.object_pixels for score in scores):
             raise DataError(
                 f"{self.truth.path}: no frame has an object (alpha is below one half everywhere); mask it "
                 "(`dpc prepare video`), or leave out psnr_foreground"
+            )
+
+    def _refuse_dim(self) -> None:
+        if self.brightest[0] == 1 < self.brightest[1]:
+            raise DataError(
+                f"{self.predicted.path}: 8-bit pictures with no value above 1; colors in 0..1 were saved without "
+                "multiplying by 255"
             )
 
     def notes(self) -> list[str]:

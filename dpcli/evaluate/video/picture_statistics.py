@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.evaluate.proportions import divide, mean_defined
-from dpcli.evaluate.results import merge_statistics
-from dpcli.evaluate.video.psnr import psnr_of
 from dpcli.evaluate.video.ssim import multi_scale, similarity
+
+PSNR_CAP = 100.0  # dB: what equal pictures score, whose PSNR is infinite (common_metrics does the same)
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,6 @@ class PictureStatistics:
     multi_scale: np.ndarray
     overlap: np.ndarray
     union: np.ndarray
-
-    def __add__(self, other: PictureStatistics) -> PictureStatistics:
-        """Returns the statistics of both sets of frames together."""
-        return merge_statistics([self, other])
 
 
 @dataclass(frozen=True)
@@ -104,14 +100,22 @@ def picture_update(
     return PictureStatistics(*(np.array([value], kind) for value, kind in zip(found, types, strict=True)))
 
 
-def frame_psnr(found: PictureStatistics) -> np.ndarray:
-    """Returns the PSNR of each frame in dB, f64 (F)."""
-    return psnr_of(found.squared, found.values, found.data_range)
+def psnr_of(squared: np.ndarray | float, values: np.ndarray | float, data_range: np.ndarray | float) -> np.ndarray:
+    """Returns the peak signal-to-noise ratio, 10 log10(range^2 / mean squared error), in dB, at most PSNR_CAP; NaN for no values.
+
+    squared: sum of squared errors, values: their number, data_range: largest possible difference; numbers or arrays.
+
+    >>> float(psnr_of(0.25, 25, 1.0)), float(psnr_of(0.0, 25, 1.0))
+    (20.0, 100.0)
+    """
+    mean = divide(squared, values)
+    with np.errstate(divide="ignore"):
+        return np.minimum(10 * np.log10(np.square(data_range)) - 10 * np.log10(mean), PSNR_CAP)
 
 
 def picture_compute(found: PictureStatistics) -> PictureMetrics:
     """Returns the metrics of RGB frames: each the mean of the frames' own values."""
-    each = frame_psnr(found)
+    each = psnr_of(found.squared, found.values, found.data_range)
     objects = psnr_of(found.inside, found.inside_values, found.data_range)
     return PictureMetrics(
         psnr=mean_defined(each),

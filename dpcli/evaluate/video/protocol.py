@@ -10,8 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import BACKGROUNDS, FVD_VARIANTS, LPIPS_NETWORKS, PICTURE_METRICS
-from dpcli.evaluate.video.picture_statistics import PictureStatistics, picture_update
-from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP, PictureStatistics, picture_update
 from dpcli.evaluate.video.sources.source import Picture
 
 SMALLEST = {"ssim": 11, "ms_ssim": 176}  # pixels a side

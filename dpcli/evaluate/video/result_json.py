@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from dpcli.evaluate.choices import PICTURE_METRICS
+from dpcli.evaluate.choices import PICTURE_METRICS, PICTURE_UNITS
 from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import intervals_json, left_out_json, none_if_nan, samples_json
 from dpcli.evaluate.video.comparison import VideoReport, view_values
@@ -15,7 +15,6 @@ from dpcli.evaluate.video.learned.base import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
 from dpcli.evaluate.video.protocol import describe_protocol
 from dpcli.evaluate.video.surface import CAMERAS, MOST_POINTS, SurfaceScore
-from dpcli.evaluate.video.tables import UNITS
 
 
 def video_json(report: VideoReport, source: str) -> dict[str, Any]:
@@ -72,7 +71,7 @@ def _surface_intervals(report: VideoReport) -> dict[str, Any]:
 
 
 def _units(report: VideoReport) -> dict[str, str]:
-    units = {name: UNITS.get(name, "1") for name in report.names if name in (*UNITS, *LEARNED_TITLES)}
+    units = {name: PICTURE_UNITS.get(name, "1") for name in report.names if name in (*PICTURE_UNITS, *LEARNED_TITLES)}
     if "surface" in report.scene:
         shares = dict.fromkeys(report.scene["surface"].values(), "fraction")
         units |= shares | {"chamfer": report.length_unit, "diameter": report.length_unit}

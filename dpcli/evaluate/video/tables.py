@@ -8,8 +8,8 @@ from dataclasses import asdict
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.evaluate.choices import PICTURE_METRICS
-from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.choices import PICTURE_METRICS, PICTURE_UNITS
+from dpcli.evaluate.metric_titles import metric_title, title_of
 from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import UNDEFINED, TextTable, four_digit_ends, four_digits, resampling_note
@@ -18,18 +18,9 @@ from dpcli.evaluate.video.frame_pass import ViewScore
 from dpcli.evaluate.video.learned.base import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import describe_protocol
-from dpcli.evaluate.video.psnr import PSNR_CAP
 from dpcli.evaluate.video.surface import CAMERAS, MOST_POINTS, SHARES, SurfaceScore
-
-TITLES = {
-    "psnr": "PSNR (dB)",
-    "psnr_foreground": "PSNR on object (dB)",
-    "ssim": "SSIM",
-    "ms_ssim": "MS-SSIM",
-    "silhouette_iou": "IoU of silhouettes",
-}
-UNITS = {name: "dB" if name.startswith("psnr") else "1" for name in TITLES}
 
 
 def video_tables(report: VideoReport) -> list[TextTable]:
@@ -50,7 +41,7 @@ def video_tables(report: VideoReport) -> list[TextTable]:
 
 def _picture_table(report: VideoReport) -> TextTable:
     names = [name for name in report.names if name in PICTURE_METRICS]
-    header = ["view", "role", "frames", *(TITLES[name] for name in names), "worst frame"]
+    header = ["view", "role", "frames", *(metric_title(name, PICTURE_UNITS[name]) for name in names), "worst frame"]
     rows = [
         [
             view.title,
@@ -84,7 +75,7 @@ def _learned_table(report: VideoReport) -> TextTable:
 
 def _interval_table(report: VideoReport) -> TextTable:
     means = report.mean() | {name: score.value for name, score in report.learned.items()}
-    titles = TITLES | LEARNED_TITLES
+    titles = {name: metric_title(name, unit) for name, unit in PICTURE_UNITS.items()} | LEARNED_TITLES
     rows = [[titles[name], four_digits(means[name]), four_digit_ends(own)] for name, own in report.intervals.items()]
     return TextTable("All views", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
 
@@ -99,7 +90,9 @@ def _frames(views: list[ViewScore]) -> str:
 
 def _cells(values: Mapping[str, float], names: list[str]) -> list[str]:
     digits = {"dB": 2, "1": 4}
-    return [UNDEFINED if np.isnan(values[name]) else f"{values[name]:.{digits[UNITS[name]]}f}" for name in names]
+    return [
+        UNDEFINED if np.isnan(values[name]) else f"{values[name]:.{digits[PICTURE_UNITS[name]]}f}" for name in names
+    ]
 
 
 def _part_table(score: PartScore) -> TextTable:
@@ -189,11 +182,7 @@ def _picture_notes(report: VideoReport) -> list[str]:
     lines = [
         f"{counts} of {width}x{height} pixels over {choices['background']}, {choices['colors']}, size: {choices['size']}; "
         f"data range {choices['data_range']}; means {choices['mean']}.",
-        *(
-            f"{TITLES[name].removesuffix(' (dB)')}: {choices[name]}."
-            for name in report.names
-            if name in PICTURE_METRICS
-        ),
+        *(f"{title_of(name)}: {choices[name]}." for name in report.names if name in PICTURE_METRICS),
     ]
     exact, empty = (sum(getattr(view.metrics, key) for view in report.views) for key in ("exact", "without_object"))
     if "psnr_foreground" in report.names:

@@ -112,6 +112,9 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         ("hello", "neither a file"),
         ("\x00\xff", "neither"),
         (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 8 metrics not finite"),
+        (json.dumps(json.loads(objects["dpc"]) | {"samples": [8]}), "samples is a list"),
+        (json.dumps(json.loads(objects["dpc"]) | {"denominators": "frames"}), "denominators is a str"),
+        (json.dumps(json.loads(objects["dpc"]) | {"notes": 3}), "notes is a int"),
     ):
         path.write_text(text)
         with pytest.raises(DpcError, match=words):

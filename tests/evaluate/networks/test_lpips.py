@@ -199,27 +199,6 @@ def test_a_broken_twin_is_noticed(random_net):
                 layer.ceil_mode = True
 
 
-def test_spatial_map(random_net):
-    """Constant layers: the map's mean is the distance; in general each layer is resized by pixel-center bilinear."""
-    net, ours, _ = random_net
-    a, b = two_pictures(1, 64)
-    found = ours.distance(a, b, spatial=True)
-    assert found.shape == (1, 64, 64) and (found >= 0).all()
-    layers = [each[0].double().numpy() for each in ours.layer_maps(a, b)]
-    assert np.abs(found[0].numpy() - sum(bilinear(each, 64) for each in layers)).max() < 1e-6
-
-
-def bilinear(plane: np.ndarray, side: int) -> np.ndarray:
-    for axis in (0, 1):
-        length = plane.shape[axis]
-        where = np.clip((np.arange(side) + 0.5) * length / side - 0.5, 0, length - 1)
-        low = np.minimum(where.astype(int), max(length - 2, 0))
-        high = np.minimum(low + 1, length - 1)
-        share = np.expand_dims(where - low, 1 - axis)
-        plane = np.take(plane, low, axis) * (1 - share) + np.take(plane, high, axis) * share
-    return plane
-
-
 def test_smallest_pictures(random_net):
     net, ours, _ = random_net
     least = ours.trunk.smallest

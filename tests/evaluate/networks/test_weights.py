@@ -23,7 +23,7 @@ from dpcli.cli.evaluate.app import WEIGHTS
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.commands import weights as commands
 from dpcli.evaluate.networks import weights as module
-from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
 from dpcli.evaluate.networks.weights import (
     Weights,
     bytes_text,
@@ -34,8 +34,10 @@ from dpcli.evaluate.networks.weights import (
     sha256_of,
     weights_folder,
     weights_named,
+    whole_weights,
 )
 from dpcli.evaluate.networks.weights_fetch import fetch_weights
+from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
 
 CONTENT = bytes(range(256)) * 40
 ENTRY = Weights(
@@ -192,11 +194,8 @@ def test_load_state_of_every_kind(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-def test_torchscript_only_where_it_is_expected(tmp_path):
-    model = small().eval()
-    torch.jit.trace(model, torch.zeros(1, 3, 8, 8)).save(str(tmp_path / "script.pt"))
-    found = load_tensors(tmp_path / "script.pt", script=True)
-    assert same({name: found[name] for name in model.state_dict()}, model.state_dict())
+def test_a_torchscript_archive_is_no_state_dict(tmp_path):
+    torch.jit.trace(small().eval(), torch.zeros(1, 3, 8, 8)).save(str(tmp_path / "script.pt"))
     with pytest.raises(DataError, match="its members claim"):  # its code is packed
         load_tensors(tmp_path / "script.pt")
 
@@ -233,19 +232,20 @@ def test_load_state_refuses(tmp_path):
         load_tensors(tmp_path / "nan.pth")
 
 
-def test_state_of_compares_first(tmp_path, monkeypatch):
+def test_a_damaged_file_is_not_opened(tmp_path, monkeypatch):
     state = small().state_dict()
     torch.save(state, tmp_path / "toy.bin")
     entry = replace(ENTRY, size=(tmp_path / "toy.bin").stat().st_size, sha256=sha256_of(tmp_path / "toy.bin"))
     monkeypatch.setattr(module, "known_weights", lambda: {"toy": entry})
-    assert same(load_weights("toy", tmp_path), state)
+    assert same(load_tensors(whole_weights("toy", tmp_path, digest=True)), state)
     monkeypatch.setattr(module, "known_weights", lambda: {"toy": replace(entry, size=entry.size + 1)})
     with pytest.raises(DataError, match="damaged weights .* fetch it again"):
-        load_weights("toy", tmp_path)
-    monkeypatch.setattr(module, "known_weights", lambda: {"toy": replace(entry, sha256="0" * 64, script=True)})
+        whole_weights("toy", tmp_path)
+    code = replace(entry, name="i3d-torchscript", sha256="0" * 64, script=True)
+    monkeypatch.setattr(module, "known_weights", lambda: {"i3d-torchscript": code})
     monkeypatch.setattr(torch.jit, "load", lambda *_, **__: pytest.fail("an archive of code, of another digest"))
-    with pytest.raises(DataError, match="damaged weights"):
-        load_weights("toy", tmp_path)
+    with pytest.raises(DataError, match="damaged weights .SHA-256"):
+        FeatureNetwork.load("styleganv", tmp_path)
 
 
 def test_fill(tmp_path):

@@ -24,10 +24,11 @@ from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
 from dpcli.evaluate.report.blocks import Table, interval_text, sort_key, table, text_of
-from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
+from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud, part_blocks
 from dpcli.evaluate.report.markdown_and_latex import escape_latex
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
+from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
 from tests.support.report_helpers import EVIL
 
 _FLAGS = "--disable-gpu --virtual-time-budget=3000 --window-size=700,600 --enable-logging=stderr".split()
@@ -126,8 +127,12 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
 def test_intervals_say_their_level_and_what_is_no_number_is_no_metric(scores, resamples, level):
     """The scores are no probabilities: without a reliability diagram, which is no metric of its own."""
     report = evaluate_classification(scores, resampling=Resampling(resamples, 0.8))
+    report.rejected = np.arange(30) < 10
     words = json.dumps(classification_json(report, "s.h5"))
     (section,) = arrange(collect(["-"], stdin=BytesIO(words.encode()))).sections
+    assert section.notes[0].startswith(
+        f"Something was recognized in 20 samples, of which {report.accepted[1]} are right"
+    )
     tables = {own.key: own for own in section.blocks if isinstance(own, Table)}
     assert tables["streams"].header[2] == level
     assert [row[0].text for row in tables["metrics"].rows] == [
@@ -230,6 +235,11 @@ def test_numbers_are_written_with_their_units():
         (b'{"task": "a", "metrics": 3}', "metrics is a int"),
         (b'{"task": "a", "metrics": {"x": NaN}}', "not JSON"),
         (b'{"task": "a", "provenance": ["x"]}', "provenance is not a list"),
+        (b'{"task": "a", "notes": 3}', "notes is a int"),
+        (b'{"task": "a", "left_out": [{"reason": "x", "names": 3}]}', "names is a int"),
+        (b'{"task": "a", "metrics": {"streams": 2.5}}', "streams is a float"),
+        (b'{"task": "motion", "metrics": {"thresholds": true}}', "thresholds is a bool"),
+        (b'{"task": "classification", "metrics": {"per_class": 7}}', "per_class is a int"),
         (b'{"task": "classification", "metrics": {"confusion": [[1, 2]]}}', "confusion has shape (1, 2)"),
         (b'{"task": "classification", "metrics": {"streams": {"a": 3}}}', "can't be shown"),
     ],
@@ -238,7 +248,7 @@ def test_what_is_no_result_is_said(tmp_path, content, words):
     path = tmp_path / "x.json"
     path.write_bytes(content)
     with pytest.raises(DataError, match=re.escape(words)) as caught:
-        arrange(collect([str(path)]))
+        arrange(collect([str(path)]), beside=["table-3.4", "table-B.3"])
     assert str(path) in str(caught.value)
 
 
@@ -253,6 +263,10 @@ def test_what_is_missing_is_said(parts, truth, tmp_path):
         collect([str(truth)])
     with pytest.raises(UsageError, match="only once"):
         collect(["-", "-"])
+    for name in ("a.mp4", "a.webm"):
+        (tmp_path / name).write_bytes(b"\x1a\x45\xdf\xa3")
+        with pytest.raises(DataError, match=r"holds 'video', which has no result in it; .* PRED=TRUTH"):
+            collect([str(tmp_path / name)])
 
 
 def test_unknown_tasks_are_shown_and_duplicates_named(tmp_path):
@@ -374,6 +388,18 @@ def test_a_cloud_is_packed_up_to_rounding():
     rest = np.frombuffer(data[42:], np.uint8).reshape(3, 7)
     assert rest[0].tolist() == [0, 1, 2, 3, 1, 2, 255] and rest[1].tolist() == [1, 0, 2, 3, 1, 2, 3]
     assert rest[2].tolist() == [0, 0, 64, 128, 255, 32, 191]
+
+
+@pytest.mark.parametrize("unit", ["m", ""])
+def test_the_color_of_a_cloud_is_named_by_what_it_shows(tmp_path, unit):
+    """End-point errors where a pair begins at the frame shown, whether the files name a unit or not; else wrong parts."""
+    sequences = [truth_sequence(f"s{k}", seed=k) for k in range(2)]
+    truth = write_truth(tmp_path / "t.h5", sequences, length_unit=unit)
+    for pairs, told in ((CHAIN, "red: end-point error up to"), (CHAIN[:0], "red: wrong part")):
+        samples = [perfect(one, 4, pairs) for one in sequences]
+        parts = write_parts(tmp_path / f"{len(pairs)}.h5", samples, length_unit=unit)
+        (cloud,) = (own for own in part_blocks(parts, truth, motion=True) if own.title == "Error clouds")
+        assert cloud.html.count(told) == 2
 
 
 def test_predicted_parts_take_the_names_of_the_true_ones():

@@ -80,7 +80,8 @@ def test_shards_add_up_exactly() -> None:
     rng = np.random.default_rng(2)
     pairs = [flow_update(*rng.normal(size=(2, n, 3))) for n in (5, 9, 1, 30, 2)]
     whole = motion_compute(merge_statistics(pairs))
-    assert motion_compute(merge_statistics(pairs[:2]) + merge_statistics(pairs[2:])).shares == whole.shares
+    halves = merge_statistics([merge_statistics(pairs[:2]), merge_statistics(pairs[2:])])
+    assert motion_compute(halves).shares == whole.shares
     with pytest.raises(DataError, match="no statistics"):
         merge_statistics([])
 

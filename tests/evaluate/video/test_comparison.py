@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,14 @@ from typer.testing import CliRunner
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import parse_video_metrics
+from dpcli.evaluate.report import arrange, collect
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
-from dpcli.evaluate.video.psnr import PSNR_CAP, psnr
-from dpcli.evaluate.video.ssim import ssim, ssim_reference
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
+from tests.support.commands import told
+from tests.support.picture_metrics import psnr, ssim, ssim_reference
 from tests.support.scenes import toy_scene
 from tests.support.video_clips import FRAMES, HEIGHT, ROLES, WIDTH, clip, header, white, write, write_folder
 
@@ -157,8 +160,10 @@ def test_the_first_difference_is_named(tmp_path: Path, truth: Path) -> None:
 def test_colors_saved_in_0_to_1_are_noticed(tmp_path: Path, truth: Path) -> None:
     dim = clip()
     dim[..., :3] = np.round(dim[..., :3] / 255)
-    with pytest.raises(DataError, match="no value above 1; colors in 0..1 were saved"):
-        evaluate_video(write(tmp_path / "dim.h5", dim), truth)
+    path = write(tmp_path / "dim.h5", dim)
+    for metrics in (None, ("warping",)):
+        with pytest.raises(DataError, match="no value above 1; colors in 0..1 were saved"):
+            evaluate_video(path, truth, metrics=metrics)
     np.save(tmp_path / "loud.npy", clip().astype(np.float32))
     with pytest.raises(DataError, match="frame 0 has values up to 255; floats are taken as 0..1"):
         evaluate_video(tmp_path / "loud.npy", truth)
@@ -200,7 +205,9 @@ def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
     part = write(tmp_path / "part.h5", some)
     result = run(truth, "--truth", part)
     assert "1 frame without an object in the truth" in result.stdout
-    assert "Predicted pictures without an object (alpha 0 everywhere): 1." in run(part, "--truth", truth).stdout
+    for metrics in (("psnr",), ("warping",), ("psnr", "warping")):
+        told_of = evaluate_video(part, truth, metrics=metrics).notes
+        assert "Predicted pictures without an object (alpha 0 everywhere): 1." in told_of
     some[..., 3] = 0
     none = write(tmp_path / "none.h5", some)
     with pytest.raises(DataError, match="no frame has an object"):
@@ -208,9 +215,13 @@ def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
     assert len(evaluate_video(truth, none, metrics=("psnr", "ssim")).views) == 4
 
 
-def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> None:
+def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="32x24; ms_ssim needs at least 176 pixels"):
         evaluate_video(said, truth, metrics=("ms_ssim",))
+    for view, side in (("0", 16), ("1", 10)):
+        write_folder(tmp_path / "views" / view, np.full((1, side, side, 4), 99, np.uint8))
+    with pytest.raises(DataError, match="10x10; ssim needs at least 11 pixels"):  # of a later view, too
+        evaluate_video(tmp_path / "views", tmp_path / "views", metrics=("ssim",))
     assert parse_video_metrics("ssim, psnr") == ("psnr", "ssim") and parse_video_metrics(None) is None
     for wrong in ("psnr,lpip", "", ","):
         with pytest.raises(
@@ -229,6 +240,9 @@ def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path:
     expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
     change = found["metrics"]["psnr"]
     assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
+    with pytest.raises(UsageError, match="--metrics fvd: protocol disco takes it of all views at once"):
+        pooled = [*command[:5], "--metrics", "psnr,fvd", "--protocol", "disco"]
+        raise CliRunner().invoke(evaluate.ROOM.application(), pooled).exception
     with pytest.raises(UsageError, match="a video holds no truth"):
         raise CliRunner().invoke(evaluate.ROOM.application(), ["compare", str(said), str(worse)]).exception
     runs = CliRunner().invoke(
@@ -285,12 +299,12 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)
 
 
-def test_a_pipe_is_read(dpc, said: Path, truth: Path) -> None:
-    piped = dpc("evaluate", "video", "-", "--truth", truth, "--json", stdin=said.read_bytes())
-    assert piped.returncode == 0, piped.stderr.decode()
+def test_a_pipe_is_read(said: Path, truth: Path) -> None:
+    words = ["video", "-", "--truth", str(truth), "--json"]
+    piped = CliRunner().invoke(evaluate.ROOM.application(), words, input=said.read_bytes())
     assert json.loads(piped.stdout)["metrics"] == json.loads(run(said, "--truth", truth, "--json").stdout)["metrics"]
-    wrong = dpc("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
-    assert wrong.returncode == 2 and wrong.stdout == b"" and b"--protocol svd" in wrong.stderr
+    wrong = told("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
+    assert (wrong.returncode, wrong.stdout) == (2, "") and "--protocol svd" in wrong.stderr
 
 
 def scene_views(folder: Path, size: int = 64) -> tuple[Path, Path]:
@@ -378,6 +392,11 @@ def test_a_scene_is_rendered_at_the_truths_cameras_and_times(tmp_path: Path) -> 
     low, high = found["surface_intervals"]["metrics"]["f_score_2"]
     assert 0 < low <= surface["f_score_2"] <= high <= 1 and surface["f_score_1"] <= surface["f_score_2"]
     assert surface["chamfer_of_diameter"] == pytest.approx(surface["chamfer"] / surface["diameter"])
+    words = json.dumps(found).encode()
+    metrics = arrange(collect(["-"], stdin=BytesIO(words), pictures=False)).sections[0].blocks[0]
+    shown = {row[0].text: row[2].text for row in metrics.rows}
+    assert shown["surface f score 2"] == f"{100 * low:.1f} to {100 * high:.1f} %"
+    assert "Of the surface: 95 %, bootstrap, BCa, 2000 resamples of 5 frames." in metrics.note
     text = run(scene, "--truth", views, "--metrics", "surface").stdout
     assert "F-score at 2 %" in text and "300 true points" in text
 

@@ -55,28 +55,27 @@ class FeatureNetwork:
     @classmethod
     def load(cls, name: str, folder: Path, device: torch.device | str = "cpu") -> FeatureNetwork:
         """Loads the published weights from `folder`. DataError, one line, when they are absent or damaged."""
-        from dpcli.evaluate.networks.state_dicts import fill_module, load_weights
-        from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
+        from dpcli.evaluate.networks.i3d import ScriptedI3D
+        from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
+        from dpcli.evaluate.networks.weights import weights_named, whole_weights
 
         variant = feature_variant(name)
-        path = find_weights(variant.weights, folder)
-        if not weights_named(variant.weights).script:
-            module = build_network(name)
-            fill_module(module, load_weights(variant.weights, folder), path)
-            return cls(variant, module, device)
-        from dpcli.evaluate.networks.i3d import ScriptedI3D
-
-        found = check_file(path, weights_named(variant.weights))
-        if found.state != "present":
-            raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
-        return cls(variant, ScriptedI3D(path), device)
+        script = weights_named(variant.weights).script  # it holds code, so its digest is compared
+        path = whole_weights(variant.weights, folder, digest=script)
+        if script:
+            return cls(variant, ScriptedI3D(path), device)
+        module = build_network(name)
+        fill_module(module, load_tensors(path), path)
+        return cls(variant, module, device)
 
     def features(self, frames: Sequence[torch.Tensor]) -> np.ndarray:
         """Returns the features f64 (D) of one clip of prepared frames f32 (3,h,w)."""
         import torch
 
+        from dpcli.evaluate.networks import full_precision
+
         clip = torch.stack(tuple(frames), dim=1)[None] if self.variant.clip != 1 else torch.stack(tuple(frames))
-        with torch.inference_mode():
+        with torch.inference_mode(), full_precision():
             return self.module(clip.to(self.device)).double().cpu().numpy()[0]
 
 
@@ -180,14 +179,14 @@ class FeatureDistance:
     each: tuple[float, ...] = ()
 
 
-def video_distance(variant: FeatureVariant, pairs: Sequence[VideoPair], root: str | None = None) -> FeatureDistance:
-    """Returns the variant's distance over videos (views, objects), as its aggregation says. root: another than the variant's.
+def video_distance(variant: FeatureVariant, pairs: Sequence[VideoPair]) -> FeatureDistance:
+    """Returns the variant's distance over videos (views, objects), as its aggregation says.
 
     Raises DataError for no videos, and for a single clip where a distribution is needed.
     """
     if not pairs:
         raise DataError(f"{variant.metric} ({variant.name}): no videos to compare")
-    options = {"root": root or variant.root, "single": variant.single}
+    options = {"root": variant.root, "single": variant.single}
     each: tuple[float, ...] = ()
     if variant.aggregation == "pooled":
         predicted, truth = (feature_merge(getattr(pair, side) for pair in pairs) for side in ("predicted", "truth"))

@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.errors import DataError
 
 ROOTS = ("eig", "scipy", "svd")
+_JITTER = 1e-6
 _TINY = 1e-10  # singular values under it are not rooted by TF-GAN's square root
 
 
@@ -44,7 +45,7 @@ class FeatureStatistics:
     def covariance(self) -> np.ndarray:
         """Returns the covariance, f64 (D,D), denominator N - 1. Raises DataError for fewer than two samples."""
         self._check_spread()
-        factor = self._deviations(self.mean)
+        factor = self.rows - self.mean
         summed = factor.T @ factor
         if self.outer is not None:
             mean = self.total / self.count
@@ -56,7 +57,7 @@ class FeatureStatistics:
         """Returns A, f64 (R,D), with A^T A = covariance; R = number of samples, or D where some are summed up."""
         self._check_spread()
         if self.outer is None:
-            return self._deviations(self.mean) / np.sqrt(self.samples - 1)
+            return (self.rows - self.mean) / np.sqrt(self.samples - 1)
         values, vectors = np.linalg.eigh(self.covariance)
         return np.sqrt(values.clip(0))[:, None] * vectors.T
 
@@ -69,9 +70,6 @@ class FeatureStatistics:
         rows = np.concatenate([self.rows, other.rows])
         total, outer = (_sum(getattr(self, key), getattr(other, key)) for key in ("total", "outer"))
         return _folded(FeatureStatistics(rows, self.count + other.count, total, outer))
-
-    def _deviations(self, mean: np.ndarray) -> np.ndarray:
-        return self.rows - mean
 
     def _check_spread(self) -> None:
         if self.samples < 2:
@@ -104,13 +102,11 @@ def feature_merge(parts: Iterable[FeatureStatistics]) -> FeatureStatistics:
     return reduce(FeatureStatistics.__add__, parts)
 
 
-def frechet_distance(
-    a: FeatureStatistics, b: FeatureStatistics, *, root: str = "eig", jitter: float = 1e-6, single: str = "error"
-) -> float:
+def frechet_distance(a: FeatureStatistics, b: FeatureStatistics, *, root: str = "eig", single: str = "error") -> float:
     """Returns |mu_a - mu_b|^2 + Tr(S_a + S_b - 2 (S_a S_b)^(1/2)), in float64, never under 0 (Dowson & Landau 1982).
 
     root: how the trace of (S_a S_b)^(1/2) is found. eig: the sum of the singular values of A B^T, where S_a = A^T A, S_b
-    = B^T B: exact for any rank; scipy: scipy.linalg.sqrtm of the product, with `jitter` on both diagonals where that is
+    = B^T B: exact for any rank; scipy: scipy.linalg.sqrtm of the product, with 1e-6 on both diagonals where that is
     not finite (StyleGAN-V, DisCo, pytorch-fid); svd: TF-GAN's symmetric square roots (VideoGPT).
     single: with fewer than two samples on a side, "error" (DataError) or "mean": the first term alone (common_metrics).
     Raises ValueError for another root.
@@ -133,7 +129,7 @@ def frechet_distance(
     else:
         own, other = a.covariance, b.covariance
         spread = np.trace(own) + np.trace(other)
-        shared = _trace_sqrtm(own, other, jitter) if root == "scipy" else _trace_svd(own, other)
+        shared = _trace_sqrtm(own, other) if root == "scipy" else _trace_svd(own, other)
     return max(between + float(spread - 2 * shared), 0.0)
 
 
@@ -165,7 +161,7 @@ def _folded(found: FeatureStatistics) -> FeatureStatistics:
     return FeatureStatistics(rows[:0], found.count + len(rows), total, outer)
 
 
-def _trace_sqrtm(own: np.ndarray, other: np.ndarray, jitter: float) -> float:
+def _trace_sqrtm(own: np.ndarray, other: np.ndarray) -> float:
     import warnings
 
     from scipy.linalg import sqrtm
@@ -174,7 +170,7 @@ def _trace_sqrtm(own: np.ndarray, other: np.ndarray, jitter: float) -> float:
         warnings.simplefilter("ignore")  # that the product is singular is known, and looked at below
         found = np.asarray(sqrtm(own @ other))
         if not np.isfinite(found).all():
-            shift = np.eye(len(own)) * jitter
+            shift = np.eye(len(own)) * _JITTER
             found = np.asarray(sqrtm((own + shift) @ (other + shift)))
     if not np.isfinite(found).all():
         raise DataError("the covariances' product has no finite square root; root eig has no such limit")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
-from functools import reduce
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.video.frechet.frame_inputs import check_picture_values
 from dpcli.evaluate.video.learned.base import FrameGap, LearnedMetric, LearnedScore
 from dpcli.ops.optical_flow import optical_flow, seen_in_both, warped
@@ -33,10 +33,6 @@ class WarpingStatistics:
     values: int = 0
     pixels: int = 0
     pairs: int = 0
-
-    def __add__(self, other: WarpingStatistics) -> WarpingStatistics:
-        """Returns the statistics of both together."""
-        return WarpingStatistics(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,8 @@ class WarpingError:
             _check(picture, predicted)
         gray = _gray(truth)
         if self._before is not None:
-            self._found += _compare_pair(self._before, (predicted, truth, gray))
+            pair = _compare_pair(self._before, (predicted, truth, gray))
+            self._found = merge_statistics([self._found, pair])
         self._before = (predicted, truth, gray)
 
     def restart(self) -> None:
@@ -88,11 +85,6 @@ class WarpingError:
         if not self._found.pairs:
             raise DataError("temporal consistency compares neighboring frames: at least 2 in a row are needed")
         return self._found
-
-
-def warping_merge(parts: Iterable[WarpingStatistics]) -> WarpingStatistics:
-    """Returns the statistics of all videos together."""
-    return reduce(WarpingStatistics.__add__, parts, WarpingStatistics())
 
 
 def warping_compute(found: WarpingStatistics) -> WarpingMetrics:
@@ -166,6 +158,6 @@ class WarpingMetric(LearnedMetric):
             "flow": "OpenCV DIS of the truth, forward-backward check",
             "error": "mean square, colors in 0..1",
             "mean": "over the pixels of each view, then over views",
-            "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4),
+            "occluded": round(warping_compute(merge_statistics(self._parts.values())).occluded, 4),
         }
         return LearnedScore("warping", value, {view: one.squared for view, one in each.items()}, own, counts, choices)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute, warping_merge
+from dpcli.evaluate.results import merge_statistics
+from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute
 from dpcli.ops.optical_flow import optical_flow, seen_in_both, warped
 from dpcli.runtime.seeds import generator
 
@@ -113,7 +114,7 @@ def test_videos_merge_as_their_pixels(moving):
         for frame in video:
             warping.add(frame, frame)
         parts.append(warping.result())
-    merged, whole = warping_compute(warping_merge(parts)), measured(moving, moving)
+    merged, whole = warping_compute(merge_statistics(parts)), measured(moving, moving)
     assert merged.pairs == whole.pairs == FRAMES - 1
     assert merged.squared == pytest.approx(whole.squared, rel=1e-12)
     assert merged.occluded == pytest.approx(whole.occluded, rel=1e-12)

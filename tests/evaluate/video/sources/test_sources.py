@@ -13,7 +13,7 @@ from PIL import Image
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
-from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.picture_statistics import PSNR_CAP
 from dpcli.evaluate.video.sources.open_source import open_source
 from dpcli.runtime.progress import log
 from dpcli.store.gaussians import write_scene
@@ -140,6 +140,10 @@ def test_frames_that_names_number_otherwise_are_told(tmp_path: Path, ours: list,
     report = evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",), intersect=len(ours) != len(theirs))
     notes = " ".join(report.notes)
     assert (f"({told})" in notes) if told else "number them otherwise" not in notes
+    alone = evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("warping",), intersect=len(ours) != len(theirs))
+    assert [note for note in alone.notes if "number them" in note] == [
+        note for note in report.notes if "number them" in note
+    ]
     if told and report.left_out:
         with pytest.raises(DataError, match=rf"compares the first \d, though their names .*{told}"):
             evaluate_video(tmp_path / "a", tmp_path / "b", metrics=("psnr",))
