@@ -9,7 +9,7 @@ import pytest
 
 from dpcli.errors import UsageError
 from dpcli.evaluate import choices
-from dpcli.evaluate.classification.metrics import ClassificationMetrics
+from dpcli.evaluate.classification.metrics import TOP_K, ClassificationMetrics
 from dpcli.evaluate.networks.lpips import NETS
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU
@@ -28,7 +28,7 @@ def test_every_word_is_known_to_the_code() -> None:
     assert set(choices.FRECHET_METRICS) == {variant.metric for variant in VARIANTS.values()}
     assert set(choices.PICTURE_METRICS) <= set(PictureMetrics.__annotations__)
     assert set(choices.SEGMENTATION_METRICS) <= set(SegmentationMetrics.__annotations__)
-    named = {f"top{choices.TOP_K}_accuracy": "top_accuracy"}
+    named = {f"top{TOP_K}_accuracy": "top_accuracy"}
     assert {named.get(name, name) for name in choices.CLASSIFICATION_METRICS} <= set(
         ClassificationMetrics.__annotations__
     )

@@ -1,4 +1,8 @@
-"""Classification metrics: `classification_metrics` of all samples, `classification_weighted` of many resamples at once."""
+"""Classification metrics: scores -> sufficient statistics -> metrics, so the statistics of shards add up exactly.
+
+`classification_compute` gives the metrics of all samples, `classification_weighted` those of many resamples at once;
+both take balanced accuracy and macro F1 from the same functions.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,31 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
-from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.proportions import divide, mean_defined, mean_defined_rows, wilson_interval
+
+TOP_K = 5
+
+
+@dataclass(frozen=True)
+class ClassificationStatistics:
+    """Holds all that the metrics need of some samples.
+
+    confusion: the confusion matrix i64 (C,C), rows truth, columns prediction. top_hits: samples whose true class is
+    among the `top_k` best scores.
+    """
+
+    confusion: np.ndarray
+    top_hits: int
+    top_k: int = TOP_K
+
+    def __add__(self, other: ClassificationStatistics) -> ClassificationStatistics:
+        """Returns the statistics of both sets of samples together; ValueError for different classes or k."""
+        if self.confusion.shape != other.confusion.shape or self.top_k != other.top_k:
+            raise ValueError(
+                f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes, "
+                f"top {self.top_k} and {other.top_k}"
+            )
+        return ClassificationStatistics(self.confusion + other.confusion, self.top_hits + other.top_hits, self.top_k)
 
 
 @dataclass(frozen=True)
@@ -18,7 +45,7 @@ class ClassificationMetrics:
 
     accuracy: correct / samples, with `interval` its Wilson interval. balanced_accuracy: mean recall over the classes
     that occur. recall: what papers call per-class accuracy. macro_f1: mean over the classes that occur or were
-    predicted. top_accuracy: truth among the TOP_K best scores; None when there are not more classes than that.
+    predicted. top_accuracy: truth among the `top_k` best scores; None when there are not more classes than that.
     support, predicted, hits: samples of each class, predictions of it, and right ones.
     """
 
@@ -28,6 +55,7 @@ class ClassificationMetrics:
     interval: tuple[float, float]
     balanced_accuracy: float
     macro_f1: float
+    top_k: int
     top_accuracy: float | None
     support: np.ndarray
     predicted: np.ndarray
@@ -47,17 +75,40 @@ def predicted_labels(scores: np.ndarray) -> np.ndarray:
     return np.asarray(scores).argmax(axis=1)
 
 
+def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> ClassificationStatistics:
+    """Returns the statistics of some samples: scores f (S,C), labels i (S) in 0..C-1.
+
+    Ties between equal scores go to the lower label, for the best class and for the k best.
+    Raises DataError when there are no samples, shapes disagree, a score is not finite or a label is out of range.
+
+    >>> found = classification_update(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
+    >>> found.confusion.tolist()
+    [[1, 0], [1, 1]]
+    """
+    scores, labels = np.asarray(scores), np.asarray(labels)
+    _check(scores, labels)
+    classes = scores.shape[1]
+    cells = labels.astype(np.int64) * classes + predicted_labels(scores)
+    confusion = np.bincount(cells, minlength=classes * classes).reshape(classes, classes)
+    return ClassificationStatistics(confusion.astype(np.int64), int(top_hits(scores, labels, top_k).sum()), top_k)
+
+
 def top_hits(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> np.ndarray:
-    """Returns whether the true class is among the `top_k` best scores of each row, bool (S): how many come before it.
+    """Returns whether the true class is among the `top_k` best scores of each row, bool (S).
 
     scores f (S,C), labels i (S); a tie goes to the lower label.
 
     >>> top_hits(np.array([[0.5, 0.3, 0.2], [0.5, 0.3, 0.2]]), np.array([1, 2]), top_k=2).tolist()
     [True, False]
     """
+    return _true_ranks(scores, labels) < top_k
+
+
+def _true_ranks(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Returns how many classes come before the true one in each row, i64 (S)."""
     own = np.take_along_axis(scores, labels[:, None].astype(np.int64), axis=1)
     before = (scores > own) | ((scores == own) & (np.arange(scores.shape[1]) < labels[:, None]))
-    return before.sum(axis=1) < top_k
+    return before.sum(axis=1)
 
 
 def _check(scores: np.ndarray, labels: np.ndarray) -> None:
@@ -77,6 +128,11 @@ def _check(scores: np.ndarray, labels: np.ndarray) -> None:
         raise DataError(f"label {labels[first]} of sample {first} is out of range; expected 0..{scores.shape[1] - 1}")
 
 
+def class_recall(hits: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """Returns the share of each class's samples that were recognized, f64 (...,C); NaN for a class that doesn't occur."""
+    return divide(hits, support)
+
+
 def class_f1(hits: np.ndarray, support: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Returns the F1 score of each class, f64 (...,C): the harmonic mean of its recall and precision.
 
@@ -88,26 +144,13 @@ def class_f1(hits: np.ndarray, support: np.ndarray, predicted: np.ndarray) -> np
     return divide(2 * hits, support + predicted)
 
 
-def classification_metrics(scores: np.ndarray, labels: np.ndarray, confidence: float = 0.95) -> ClassificationMetrics:
-    """Returns the metrics of scores f (S,C) and labels i (S) in 0..C-1; confidence: of the Wilson interval of the accuracy.
-
-    Ties between equal scores go to the lower label, for the best class and for the TOP_K best.
-    Raises DataError when there are no samples, shapes disagree, a score is not finite or a label is out of range.
-
-    >>> found = classification_metrics(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
-    >>> found.correct, found.samples, found.balanced_accuracy, found.confusion.tolist()
-    (2, 3, 0.75, [[1, 0], [1, 1]])
-    >>> [round(end, 3) for end in found.interval]
-    [0.208, 0.939]
-    """
-    scores, labels = np.asarray(scores), np.asarray(labels)
-    _check(scores, labels)
-    classes = scores.shape[1]
-    cells = labels.astype(np.int64) * classes + predicted_labels(scores)
-    confusion = np.bincount(cells, minlength=classes * classes).reshape(classes, classes)
+def classification_compute(statistics: ClassificationStatistics, confidence: float = 0.95) -> ClassificationMetrics:
+    """Returns the metrics that statistics stand for; confidence: of the Wilson interval of the accuracy."""
+    confusion = statistics.confusion
     support, predicted, hits = confusion.sum(axis=1), confusion.sum(axis=0), confusion.diagonal()
-    samples, correct = len(labels), int(hits.sum())
-    recall, f1 = divide(hits, support), class_f1(hits, support, predicted)
+    samples, correct = int(support.sum()), int(hits.sum())
+    recall, f1 = class_recall(hits, support), class_f1(hits, support, predicted)
+    ranked = len(confusion) > statistics.top_k
     return ClassificationMetrics(
         samples=samples,
         correct=correct,
@@ -115,7 +158,8 @@ def classification_metrics(scores: np.ndarray, labels: np.ndarray, confidence: f
         interval=wilson_interval(correct, samples, confidence),
         balanced_accuracy=mean_defined(recall),
         macro_f1=mean_defined(f1),
-        top_accuracy=float(divide(top_hits(scores, labels).sum(), samples)) if classes > TOP_K else None,
+        top_k=statistics.top_k,
+        top_accuracy=float(divide(statistics.top_hits, samples)) if ranked else None,
         support=support,
         predicted=predicted,
         hits=hits,
@@ -126,10 +170,24 @@ def classification_metrics(scores: np.ndarray, labels: np.ndarray, confidence: f
     )
 
 
-def classification_weighted(scores: np.ndarray, labels: np.ndarray) -> WeightedMetric:
+def classification_metrics(
+    scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K, confidence: float = 0.95
+) -> ClassificationMetrics:
+    """Returns the metrics of scores f (S,C) and labels i (S) in 0..C-1. Raises as `classification_update`.
+
+    >>> found = classification_metrics(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
+    >>> found.correct, found.samples, found.balanced_accuracy
+    (2, 3, 0.75)
+    >>> [round(end, 3) for end in found.interval]
+    [0.208, 0.939]
+    """
+    return classification_compute(classification_update(scores, labels, top_k), confidence)
+
+
+def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> WeightedMetric:
     """Returns the metrics of scores f (S,C) and labels i (S) as functions of how often each sample counts.
 
-    They are accuracy, balanced_accuracy, macro_f1 and, where there are more classes than TOP_K, top-k accuracy.
+    They are accuracy, balanced_accuracy, macro_f1 and, where there are more classes than `top_k`, top-k accuracy.
     """
     classes = scores.shape[1]
     best = predicted_labels(scores)
@@ -140,8 +198,8 @@ def classification_weighted(scores: np.ndarray, labels: np.ndarray) -> WeightedM
     sort = np.argsort(order, kind="stable")
     starts = np.searchsorted(order[sort], np.arange(len(cells)))
     shares = {"accuracy": best == labels}
-    if classes > TOP_K:
-        shares[f"top{TOP_K}_accuracy"] = top_hits(scores, labels)
+    if classes > top_k:
+        shares[f"top{top_k}_accuracy"] = top_hits(scores, labels, top_k)
     share_of_samples = means_of_samples({key: hit.astype(np.float64) for key, hit in shares.items()})
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
@@ -150,7 +208,7 @@ def classification_weighted(scores: np.ndarray, labels: np.ndarray) -> WeightedM
         hits = np.zeros_like(support)
         hits[:, of_truth[right]] = summed[:, right]
         return share_of_samples(counts) | {
-            "balanced_accuracy": mean_defined_rows(divide(hits, support)),
+            "balanced_accuracy": mean_defined_rows(class_recall(hits, support)),
             "macro_f1": mean_defined_rows(class_f1(hits, support, predicted)),
         }
 

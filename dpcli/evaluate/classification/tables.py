@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dpcli.counted import counted
-from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
@@ -59,7 +58,7 @@ def _stream_table(report: ClassificationReport) -> TextTable:
         "accuracy",
         "correct",
         interval,
-        *([f"top-{TOP_K}"] if top else []),
+        *([f"top-{report.main.top_k}"] if top else []),
         "balanced accuracy",
         "macro F1",
         "calibration error",
@@ -87,8 +86,8 @@ def _interval_tables(report: ClassificationReport) -> list[TextTable]:
     """Returns bootstrap intervals of what isn't a share of the samples, and of top-k accuracy; none without resamples."""
     if not report.resampling.resamples:
         return []
-    top = f"top{TOP_K}_accuracy"
-    titles = {top: f"top-{TOP_K}", "balanced_accuracy": "balanced accuracy", "macro_f1": "macro F1"}
+    top = f"top{report.main.top_k}_accuracy"
+    titles = {top: f"top-{report.main.top_k}", "balanced_accuracy": "balanced accuracy", "macro_f1": "macro F1"}
     titles["calibration_error"] = "calibration error"
     if report.main.top_accuracy is None:
         titles.pop(top)

@@ -1,4 +1,4 @@
-"""Classification metrics against scikit-learn and hand-computed values."""
+"""Classification metrics against scikit-learn, hand-computed values, and themselves cut into shards."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from sklearn import metrics as reference
 
 from dpcli.errors import DataError
-from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.classification.metrics import (
     ClassificationMetrics,
+    ClassificationStatistics,
+    classification_compute,
     classification_metrics,
+    classification_update,
     predicted_labels,
-    top_hits,
 )
 from dpcli.evaluate.proportions import divide, mean_defined, wilson_interval
 
@@ -46,8 +49,8 @@ def assert_agrees_with_sklearn(metrics: ClassificationMetrics, scores: np.ndarra
         assert metrics.balanced_accuracy == pytest.approx(balanced, abs=1e-12)
     macro = reference.f1_score(labels, predicted, labels=present, average="macro")
     assert metrics.macro_f1 == pytest.approx(macro, abs=1e-12)
-    if scores.shape[1] > TOP_K:
-        top = reference.top_k_accuracy_score(labels, scores, k=TOP_K, labels=classes)
+    if scores.shape[1] > metrics.top_k:
+        top = reference.top_k_accuracy_score(labels, scores, k=metrics.top_k, labels=classes)
         assert metrics.top_accuracy == pytest.approx(top, abs=1e-12)
 
 
@@ -59,8 +62,12 @@ def test_metrics_equal_sklearn(samples: int, classes: int) -> None:
 
 
 def broken_transposed(scores: np.ndarray, labels: np.ndarray) -> ClassificationMetrics:
-    """What was predicted taken for the truth."""
-    return classification_metrics(np.eye(scores.shape[1])[labels], scores.argmax(1))
+    good = classification_update(scores, labels)
+    return classification_compute(ClassificationStatistics(good.confusion.T, good.top_hits))
+
+
+def broken_off_by_one(scores: np.ndarray, labels: np.ndarray) -> ClassificationMetrics:
+    return classification_compute(classification_update(scores, labels, top_k=4))
 
 
 def broken_padding(scores: np.ndarray, labels: np.ndarray) -> ClassificationMetrics:
@@ -77,7 +84,8 @@ def test_the_checker_rejects_broken_twins(broken) -> None:
 
 def test_the_checker_sees_a_wrong_k() -> None:
     scores, labels = random_case(3, 120, 8)
-    assert top_hits(scores, labels, 4).mean() < classification_metrics(scores, labels).top_accuracy
+    right, wrong = classification_metrics(scores, labels), broken_off_by_one(scores, labels)
+    assert wrong.top_accuracy < right.top_accuracy
 
 
 def test_by_hand() -> None:
@@ -113,6 +121,41 @@ def test_five_best_of_five_is_no_number() -> None:
     assert classification_metrics(np.eye(6), np.arange(6)).top_accuracy == 1
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    samples=st.integers(1, 60),
+    classes=st.integers(1, 9),
+    ties=st.booleans(),
+    data=st.data(),
+)
+def test_shards_add_up_to_the_whole(seed: int, samples: int, classes: int, ties: bool, data: st.DataObject) -> None:
+    scores, labels = random_case(seed, samples, classes, ties)
+    cuts = sorted(data.draw(st.sets(st.integers(1, max(samples - 1, 1)), max_size=4)))
+    parts = [p for p in zip(np.split(scores, cuts), np.split(labels, cuts), strict=True) if len(p[0])]
+    first, *others = [classification_update(*part) for part in parts]
+    merged = sum(others, first)
+    whole = classification_update(scores, labels)
+    assert merged.confusion.tolist() == whole.confusion.tolist() and merged.top_hits == whole.top_hits
+    assert merged.confusion.dtype == np.int64
+    once, again = classification_compute(whole), classification_compute(merged)
+    assert (once.accuracy, once.interval, once.top_accuracy) == (again.accuracy, again.interval, again.top_accuracy)
+
+
+def test_averaging_the_accuracy_of_shards_is_not_merging() -> None:
+    """Why statistics are merged: shards of 1 and 9 samples."""
+    scores, labels = np.eye(2, dtype=np.float32)[[0] * 10], np.array([0] + [1] * 9)
+    parts = [classification_update(scores[:1], labels[:1]), classification_update(scores[1:], labels[1:])]
+    assert classification_compute(parts[0] + parts[1]).accuracy == pytest.approx(0.1)
+    assert np.mean([classification_compute(part).accuracy for part in parts]) == pytest.approx(0.5)
+
+
+def test_statistics_of_different_classes_do_not_add() -> None:
+    two, three = classification_update(np.eye(2), np.arange(2)), classification_update(np.eye(3), np.arange(3))
+    with pytest.raises(ValueError, match="2 and 3 classes"):
+        two + three
+
+
 @pytest.mark.parametrize(
     ("scores", "labels", "said"),
     [
@@ -128,7 +171,7 @@ def test_five_best_of_five_is_no_number() -> None:
 )
 def test_bad_input_is_named(scores: np.ndarray, labels: np.ndarray, said: str) -> None:
     with pytest.raises(DataError, match=said):
-        classification_metrics(scores, labels)
+        classification_update(scores, labels)
 
 
 def test_divide_owns_the_zero() -> None:
