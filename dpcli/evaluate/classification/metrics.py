@@ -12,9 +12,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
+from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.proportions import divide, mean_defined, mean_defined_rows, wilson_interval
-
-TOP_K = 5
 
 
 @dataclass(frozen=True)
