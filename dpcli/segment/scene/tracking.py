@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import fractional_matrix_power
 from scipy.spatial import cKDTree
 
 from dpcli.segment.scene.object_motion import refine
@@ -53,7 +54,9 @@ def moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
 
 
 def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
-    """Returns the motion to a frame; to one that is not known, with the nearest step repeated."""
+    """Returns the motion to a frame; to one that is not known, with the nearest step repeated, a part of it a frame where it
+    leads over several.
+    """
     if frame in known or len(known) < 2:
         return known.get(frame, next(iter(known.values())))
     numbers = np.array(sorted(known))
@@ -61,7 +64,7 @@ def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
     inner = int(numbers[np.argsort(np.abs(numbers - edge), kind="stable")[1]])
     step = known[edge] @ np.linalg.inv(known[inner])
     step = step if edge > inner else np.linalg.inv(step)
-    return np.linalg.matrix_power(step, frame - edge) @ known[edge]
+    return fractional_matrix_power(step, (frame - edge) / abs(edge - inner)).real @ known[edge]
 
 
 def track(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -> None:
