@@ -50,8 +50,11 @@ class Outcome:
     flow: Tensor | None = None
 
 
-def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float) -> Outcome:
-    """Returns the loss of a batch with every term that is on at `progress`, the share (0 to 1) of the training that is over."""
+def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float, rng: torch.Generator) -> Outcome:
+    """Returns the loss of a batch with every term that is on at `progress`, the share (0 to 1) of the training that is over.
+
+    rng: of the turns that the invariance is judged by.
+    """
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
@@ -72,7 +75,8 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
     if progress >= objective.smooth_after:
         terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbors(batch.points))
     if objective.invariance:
-        terms["invariance"] = objective.invariance * invariance_loss(mask, model(turn_randomly(batch.points)[0]).mask)
+        turned, _ = turn_randomly(batch.points, rng)
+        terms["invariance"] = objective.invariance * invariance_loss(mask, model(turned).mask)
     loss = torch.stack(list(terms.values())).sum()
     values = {name: float(term.detach()) for name, term in terms.items()}
     if beta is not None:
@@ -170,15 +174,16 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
     """Returns the loss with labels for the masks and the true flow for the motion head."""
     terms = {"mask": supervised_loss(frames.mask, batch.part)}
     if model.motion is not None:
-        truth = torch.nn.functional.one_hot(batch.part.clamp(0, model.config.slots - 1), model.config.slots).float()
-        truth = truth * (batch.part >= 0)[..., None]  # what is unknown moves with no part
+        slots = model.config.slots
+        truth = torch.nn.functional.one_hot(batch.part.clamp(0, slots - 1), slots).float()
+        truth = truth * ((batch.part >= 0) & (batch.part < slots))[..., None]  # others move with none of these parts
         rotation, _ = weighted_kabsch(batch.points, batch.points + batch.flow, truth)
         terms["motion"] = objective.motion * _motion(model, batch, frames, truth, rotation)
     loss = torch.stack(list(terms.values())).sum()
     return Outcome(loss, {name: float(term.detach()) for name, term in terms.items()})
 
 
-def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+def turn_randomly(points: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     """Returns each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
     rotation = quaternion_to_matrix(normalize_quaternion(torch.randn(half, 4, generator=rng))).to(points)
