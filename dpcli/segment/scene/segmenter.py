@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
@@ -15,7 +12,7 @@ from dpcli.runtime.progress import log
 from dpcli.segment.scene.explain import SceneExplanation, explain_scene
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.tracking import moved
-from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.segment.segmenters import Segmenter
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
 from dpcli.store.schema import METERS
@@ -32,17 +29,11 @@ class SceneSegmenter(Segmenter):
     """Explains lidar scans and depth images of streets: the sensor's own motion, and objects that move on their own."""
 
     settings: SceneSettings
-    needs_flows: ClassVar[bool] = False
 
     @property
     def slots(self) -> int:
         """Returns how many objects a sequence may have at most, the background included."""
         return self.settings.most_objects + 1
-
-    def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Returns labels as masks of zeros and ones, of frames (N_t,3) in meters seen from their origin."""
-        found = explain_scene([np.float64(frame) for frame in frames], [np.zeros(3)], self.settings)
-        return [torch.nn.functional.one_hot(torch.from_numpy(own), self.slots).float() for own in found.labels]
 
     def explain(
         self, sequence: CloudSequence, pairs: list[tuple[int, int]], length_unit: str
