@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dpcli.segment.multibody.explanation import Explanation, body_of, label_points
-from dpcli.segment.multibody.frames import Frames, choose_partners, move, relative_motion
+from dpcli.segment.multibody.frames import Frames, choose_partners, relative_motion
 from dpcli.segment.multibody.hypotheses import Hypothesis
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
@@ -17,6 +17,7 @@ from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import fit_motions, follow_tracks, parts_of_tracks
 from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import Refinement
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.training.trainer import rand_index
 from dpcli.store import CloudSequence
 
