@@ -23,7 +23,7 @@ from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.tracking import extended
 from dpcli.segment.scene.world import UNSEEN, Frame
-from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store import CloudSequence, CloudsWriter, PartsSample
 
 LIDAR = Lidar(tuple(np.linspace(2, -22, 32)), 700, 60.0)
 PAIRS = [(0, 1), (1, 2)]
@@ -202,6 +202,21 @@ def test_frames_that_repeat_the_one_before_are_looked_at_once(capsys):
         np.testing.assert_allclose(flow, once, atol=1e-6)
     sequence.part = np.concatenate(again)
     assert _speed(sequence, more, 0, "m") == _speed(with_part(truth, labels), said, 0, "m")
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (450, -540, 3)])
+def test_the_speed_of_a_sensor_that_turns_is_its_own_and_not_that_of_what_it_sees(place):
+    """It looks ahead, at things 20 m away, and drives 0.8 m a frame around a bend; its place is known by `shift`."""
+    step, away = np.eye(4), np.eye(4)
+    step[:3, :3], step[0, 3] = Rotation.from_rotvec([0, 0, 0.05]).as_matrix(), 0.8
+    away[:3, 3] = place
+    points = np.random.default_rng(0).normal([20, 0, 0], 3, (100, 3)) + place
+    shift = -np.array(place, float) if any(place) else None
+    sequence = CloudSequence.from_frames("bend", [points] * 2, part=[np.zeros(100, int)] * 2, shift=shift)
+    sequence.points[100:] += 1  # another frame
+    motion = away @ np.linalg.inv(step) @ np.linalg.inv(away)
+    said = PartsSample(np.ones((200, 1)), np.array([[0, 1]]), motion[None, None], [])
+    assert _speed(sequence, said, 0, "m") == "0.80 m a frame"
 
 
 def with_part(sequence, labels):
