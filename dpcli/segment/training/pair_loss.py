@@ -66,9 +66,11 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
     terms: dict[str, Tensor] = {}
     if order is not None and progress >= objective.motion_after:
         matched = _matched(mask.detach(), order)
-        terms["motion"] = objective.motion * _motion(model, batch, frames, matched, rotation)
+        answer = model.pair(batch.points, frames, matched)
+        terms["motion"] = objective.motion * _motion(model, answer, matched, rotation)
         if objective.consensus != "none" and progress >= objective.consensus_after:
-            beta = _consensus(model, batch, frames, order, objective)
+            motions = model.motions(batch.points, frames, matched, answer)
+            beta = _consensus(batch, mask.detach(), order, motions, objective)
     if objective.cold_start and progress < objective.cold_until:
         terms["cold_start"] = objective.cold_start * _cold_start(batch, mask)
     terms["dynamic"] = objective.dynamic * _rigidity(batch, mask, rotation, translation, beta, objective)
@@ -126,27 +128,27 @@ def _matched(mask: Tensor, order: Tensor) -> Tensor:
     return torch.cat([mask[:first], permute_slots(mask[first:], order)])
 
 
-def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tensor, rotation: Tensor) -> Tensor:
-    """Returns the motion head's loss against the rotations that flow and masks imply.
+def _motion(model: PartNetwork, answer: tuple[Tensor, Tensor], matched: Tensor, rotation: Tensor) -> Tensor:
+    """Returns the loss of the motion head's answer (`PartNetwork.pair`) against the rotations that flow and masks imply.
 
     Only slots of more than 2 % of the points count.
     """
-    confidence, residual = model.pair(batch.points, frames, matched)
     half = len(matched) // 2
     share = matched.mean(1)
     weight = torch.minimum(share[:half], share[half:])
     weight = torch.where(weight > 0.02, weight, 0.0)
-    return rotation_loss(confidence, residual, rotation[:half], weight, model.motion.group)
+    return rotation_loss(*answer, rotation[:half], weight, model.motion.group)
 
 
 @torch.no_grad()
-def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tensor, objective: Objective) -> Tensor:
+def _consensus(
+    batch: Batch, mask: Tensor, order: Tensor, motions: tuple[Tensor, Tensor], objective: Objective
+) -> Tensor:
     """Returns beta (2B,N,S) of eq. 4.7.
 
-    The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots.
+    motions: the head's, from frames 1 to 2; frames 2 to 1 have their inverse, in frames 2's slots.
     """
-    mask = frames.mask.detach()
-    rotation, translation = model.motions(batch.points, frames, _matched(mask, order))
+    rotation, translation = motions
     back = order.argsort(1)
     inverse = rotation.mT
     inverse_shift = -(inverse @ translation[..., None]).squeeze(-1)
@@ -166,7 +168,7 @@ def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Obje
     """Returns the flow of eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
-    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
+    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, order=both)
     return objective.flow_decay * batch.flow + (1 - objective.flow_decay) * newest
 
 
@@ -178,7 +180,7 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
         truth = torch.nn.functional.one_hot(batch.part.clamp(0, slots - 1), slots).float()
         truth = truth * ((batch.part >= 0) & (batch.part < slots))[..., None]  # others move with none of these parts
         rotation, _ = weighted_kabsch(batch.points, batch.points + batch.flow, truth)
-        terms["motion"] = objective.motion * _motion(model, batch, frames, truth, rotation)
+        terms["motion"] = objective.motion * _motion(model, model.pair(batch.points, frames, truth), truth, rotation)
     loss = torch.stack(list(terms.values())).sum()
     return Outcome(loss, {name: float(term.detach()) for name, term in terms.items()})
 

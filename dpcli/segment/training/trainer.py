@@ -86,7 +86,8 @@ class Trainer:
 
     def _steps(self) -> int:
         """Returns the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
-        return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch or None)) // self.schedule.batch, 1)
+        count = len(self.training.pairs)
+        return max(min(self.schedule.pairs_per_epoch or count, count) // self.schedule.batch, 1)
 
     def _run_epoch(self, bar: Progress) -> None:
         """Learns from the pairs that are left of the epoch, and saves now and then."""
