@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import SegmentStream, generator
+from dpcli.segment.rigid_motions import move_each
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.parts import PartsReader, PartsSample
 
@@ -28,7 +29,7 @@ class Pair:
 
 @dataclass
 class LoadedPair:
-    """Holds one pair. points f32 (2,N,3): in units of the sequence's diameter, centered; part i64 (2,N): -1 unknown.
+    """Holds one pair. points f32 (2,N,3): in units of the two frames' diameter, centered; part i64 (2,N): -1 unknown.
 
     flow f32 (2,N,3): the true one each way, None without poses and scene_flow.
     """
@@ -185,8 +186,7 @@ def true_flow(points: np.ndarray, part: np.ndarray, source: np.ndarray, target: 
 
     Points of unknown parts move as part 0.
     """
-    motion = (target @ np.linalg.inv(source))[np.clip(part, 0, None)]
-    return np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
+    return move_each((target @ np.linalg.inv(source))[np.clip(part, 0, None)], points) - points
 
 
 def epoch_order(source: PairSource, epoch: int, most: int | None) -> list[Pair]:

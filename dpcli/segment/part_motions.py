@@ -16,7 +16,6 @@ from dpcli.segment.segmenters import Flows
 
 _SMALL = 1024  # points of a frame up to which one thread is enough after the network
 _TOGETHER = 8  # pairs of frames whose motions are refined at once
-_TEMPERATURE = 0.01  # of object-aware ICP, in diameters
 
 Pairs = list[tuple[int, int]]
 
@@ -58,7 +57,7 @@ def _fit_pairs(
     if steps == 0:
         return start
     same = torch.arange(mask1.shape[2]).expand(len(first), -1)
-    _, rotation, shift = object_aware_icp(first, second, mask1, mask2, flow, steps, _TEMPERATURE, same)
+    _, rotation, shift = object_aware_icp(first, second, mask1, mask2, flow, steps, same)
     gaps = [_measure_gap(first, second, mask1, *motion) for motion in (start, (rotation, shift))]  # [B, S] each
     better = gaps[1] <= gaps[0]
     return (torch.where(better[..., None, None], rotation, start[0]), torch.where(better[..., None], shift, start[1]))

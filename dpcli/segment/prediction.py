@@ -19,7 +19,7 @@ from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
 from dpcli.segment.prediction_settings import Refinement
-from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.segment.segmenters import Flows, FrameSegmenter
 from dpcli.segment.split_by_motion import split_by_motion
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
@@ -44,7 +44,12 @@ class _Frames:
 
 
 def predict_parts(
-    sequence: CloudSequence, index: int, segmenter: Segmenter, estimate: Estimate, options: Refinement, seed: int
+    sequence: CloudSequence,
+    index: int,
+    segmenter: FrameSegmenter | MultibodySegmenter,
+    estimate: Estimate,
+    options: Refinement,
+    seed: int,
 ) -> tuple[np.ndarray, PartsSample]:
     """Returns hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
 
@@ -144,7 +149,11 @@ def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
 
 
 def _find_masks_and_motions(
-    frames: _Frames, pairs: Pairs, segmenter: Segmenter, estimate: Estimate, options: Refinement
+    frames: _Frames,
+    pairs: Pairs,
+    segmenter: FrameSegmenter | MultibodySegmenter,
+    estimate: Estimate,
+    options: Refinement,
 ) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
     """Returns the masks (N_t,S) and for every pair the motions (S,3,3), (S,3).
 
@@ -161,7 +170,7 @@ def _find_masks_and_motions(
 
 
 def _find_flows_and_masks(
-    frames: list[Tensor], pairs: Pairs, estimate: Estimate, segmenter: Segmenter
+    frames: list[Tensor], pairs: Pairs, estimate: Estimate, segmenter: FrameSegmenter
 ) -> tuple[Flows, list[Tensor]]:
     """Returns the flows between the frames of the pairs and between neighbors, both ways at once, and the masks.
 

@@ -22,6 +22,19 @@ _CHUNK = 8  # frames that the network sees at once
 
 
 class Segmenter(ABC):
+    """Divides the frames of a sequence into parts: one by one (`FrameSegmenter`), or all together with their motions."""
+
+    @property
+    @abstractmethod
+    def slots(self) -> int:
+        """Returns the number of columns of every mask."""
+
+    def record(self) -> dict[str, Any]:
+        """Returns what the provenance of a file says of the segmenter."""
+        return {}
+
+
+class FrameSegmenter(Segmenter):
     """Divides frames into soft masks.
 
     needs_flows: whether `segment` looks at flows, so that it must wait for them.
@@ -29,22 +42,13 @@ class Segmenter(ABC):
 
     needs_flows: ClassVar[bool] = True
 
-    @property
-    @abstractmethod
-    def slots(self) -> int:
-        """Returns the number of columns of every mask."""
-
     @abstractmethod
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
         """Returns a mask (N_t,S) f32 for each frame (N_t,3); rows sum to 1. flows: between pairs of the frames."""
 
-    def record(self) -> dict[str, Any]:
-        """Returns what the provenance of a file says of the segmenter."""
-        return {}
-
 
 @dataclass(frozen=True)
-class NetworkSegmenter(Segmenter):
+class NetworkSegmenter(FrameSegmenter):
     """Takes the masks of a part network; frames of equally many points are given to it together."""
 
     model: PartNetwork
@@ -83,7 +87,7 @@ class NetworkSegmenter(Segmenter):
 
 
 @dataclass(frozen=True)
-class ClassicalSegmenter(Segmenter):
+class ClassicalSegmenter(FrameSegmenter):
     """Takes the labels of a classical method as masks of zeros and ones."""
 
     settings: ClassicalSettings

@@ -54,9 +54,7 @@ def stages() -> dict[str, Stage]:
         rng = torch.Generator().manual_seed(0)
         mask = torch.softmax(4 * torch.randn(*clouds.shape[:2], 8, generator=rng), -1)
         order = torch.arange(8).expand(len(clouds) - 1, -1)
-        return object_aware_icp(
-            clouds[:-1], clouds[1:], mask[:-1], mask[1:], torch.zeros_like(clouds[1:]), 20, 0.01, order
-        )
+        return object_aware_icp(clouds[:-1], clouds[1:], mask[:-1], mask[1:], torch.zeros_like(clouds[1:]), 20, order)
 
     def kabsch(sequence: CloudSequence) -> object:
         clouds = torch.stack(frames(sequence))

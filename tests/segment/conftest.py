@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dpcli.store import CloudsWriter
+from tests.support.commands import told
 from tests.support.drawers import TRAIN, drawer, drawers, with_scene_flow
 
 
@@ -16,11 +17,11 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def run_folder(dpc, data, tmp_path_factory) -> Path:
+def run_folder(data, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "model"
-    done = dpc("segment", "train", data, "-o", folder, *TRAIN)
-    assert done.returncode == 0, done.stderr.decode()
-    assert done.stdout.decode().strip() == str(folder / "best.safetensors")
+    done = told("segment", "train", data, "-o", folder, *TRAIN)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(folder / "best.safetensors")
     return folder
 
 

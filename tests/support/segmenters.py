@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.segment.segmenters import Flows, FrameSegmenter
 
 
 @dataclass(frozen=True)
-class FunctionSegmenter(Segmenter):
+class FunctionSegmenter(FrameSegmenter):
     """Gives the masks that `function` gives for frames and flows."""
 
     function: Callable[[list[Tensor], Flows], list[Tensor]]

@@ -68,18 +68,16 @@ def trajectory_affinity(
     d is the mean distance of two trajectories in units of `reach`, motions count in units of `sigma` (both lengths).
     Brox & Malik, ECCV 2010; Ochs, Malik & Brox, TPAMI 2014, with one sigma in place of the image's local variation.
     """
-    if motion.shape[1] == 0:
-        return np.ones((len(motion), len(motion)))
-    apart = np.mean([np.sqrt(_squared_distances(frame)) for frame in trajectories.swapaxes(0, 1)], axis=0)
-    differs = np.max([_squared_distances(frame) for frame in motion.swapaxes(0, 1)], axis=0)
-    return np.exp(-apart / reach * differs / sigma**2)
-
-
-def _squared_distances(points: np.ndarray) -> np.ndarray:
-    """Returns the squared distances f64 (N,N) of all pairs of points (N,3)."""
     from scipy.spatial.distance import cdist
 
-    return cdist(points, points, "sqeuclidean")
+    apart, differs = np.zeros((2, len(motion), len(motion)))
+    for points in trajectories.swapaxes(
+        0, 1
+    ):  # frame by frame: all of a long sequence's distances would fill the memory
+        apart += np.sqrt(cdist(points, points, "sqeuclidean"))
+    for way in motion.swapaxes(0, 1):
+        np.maximum(differs, cdist(way, way, "sqeuclidean"), out=differs)
+    return np.exp(-(apart / trajectories.shape[1]) / reach * differs / sigma**2)
 
 
 def spectral_parts(

@@ -11,6 +11,7 @@ from torch import Tensor
 from dpcli.errors import UsageError
 from dpcli.ops import fps_numpy, gather_points, knn
 from dpcli.segment.flow.rigid_bodies import Bodies, BodySearch, find_bodies
+from dpcli.segment.rigid_motions import invert, move_each
 
 METHODS = ("icp", "nearest")
 _FEWEST, _MOST = 16, 1024  # points of a frame that ICP works with
@@ -69,11 +70,9 @@ def estimate_flow_both_ways(first: Tensor, second: Tensor, method: str) -> tuple
 
     one, two = (cloud.numpy().astype(np.float64) for cloud in (first, second))
     bodies = find_bodies_at_any_scale(one, two)
-    moved = _move_each(bodies.motion[bodies.label], one)
+    moved = move_each(bodies.motion[bodies.label], one)
     label = bodies.label[cKDTree(moved).query(two)[1]]
-    rotation = bodies.motion[:, :, :3].swapaxes(1, 2)
-    inverse = np.concatenate([rotation, -rotation @ bodies.motion[:, :, 3:]], 2)
-    back = _move_each(inverse[label], two) - two
+    back = move_each(invert(bodies.motion)[label], two) - two
     return torch.from_numpy(np.float32(moved - one)), torch.from_numpy(np.float32(back))
 
 
@@ -84,7 +83,7 @@ def estimate_body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySea
     the nearest one kept. Below 16 points, or without extent, all points shift by the difference of the means.
     """
     bodies = find_bodies_at_any_scale(points1, points2, search)
-    return (_move_each(bodies.motion[bodies.label], points1.astype(np.float64)) - points1).astype(np.float32)
+    return (move_each(bodies.motion[bodies.label], points1.astype(np.float64)) - points1).astype(np.float32)
 
 
 def find_bodies_at_any_scale(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> Bodies:
@@ -110,8 +109,3 @@ def find_bodies_at_any_scale(points1: np.ndarray, points2: np.ndarray, search: B
 def _thin(points: np.ndarray) -> np.ndarray:
     """Returns the indices of at most 1,024 farthest points."""
     return np.arange(len(points)) if len(points) <= _MOST else fps_numpy(points, _MOST)
-
-
-def _move_each(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns each point (N,3) moved by its own motion (N,3,4)."""
-    return np.einsum("nij,nj->ni", motion[:, :, :3], points) + motion[:, :, 3]

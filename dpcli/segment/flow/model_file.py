@@ -6,7 +6,6 @@ import functools
 import json
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -78,16 +77,3 @@ def _estimate_pair(model: FlowStep3D, points1: Tensor, points2: Tensor) -> Tenso
 def _thin(points: Tensor) -> Tensor:
     """Returns at most 2,048 farthest points of a cloud (1,N,3)."""
     return points if points.shape[1] <= _MOST else gather_points(points, fps(points, _MOST))
-
-
-def augment_pair(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Returns a training pair f32 (2,N,3) changed at random, as FlowStep3D is trained on SAPIEN.
-
-    Both frames are scaled by 0.95 to 1.05 per axis, turned by at most 10 degrees about y and shifted by at most 0.05; the
-    second is shifted by at most 0.01 more.
-    """
-    angle = rng.uniform(-np.pi / 18, np.pi / 18)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    changed = (points * rng.uniform(0.95, 1.05, 3)) @ turn.T + rng.uniform(-0.05, 0.05, 3)
-    changed[1] += rng.uniform(-0.01, 0.01, 3)
-    return changed.astype(np.float32)

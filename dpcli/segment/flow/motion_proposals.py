@@ -35,17 +35,11 @@ def shift_by(offsets: np.ndarray) -> np.ndarray:
     return np.concatenate([np.broadcast_to(np.eye(3), (len(offsets), 3, 3)), offsets[:, :, None]], 2)
 
 
-def compose_motions(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Returns motions (...,3,4) that follow one other motion (3,4)."""
-    rotation = after[..., :3] @ before[:, :3]
-    return np.concatenate([rotation, after[..., :3] @ before[:, 3:] + after[..., 3:]], -1)
-
-
 def propose_motions(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
-    """Returns motions (H,3,4) that a part (n,3) is likely to make; the first is the identity.
+    """Returns motions (H,3,4) that a part (n,3) is likely to make.
 
-    The others turn about its edges (doors, lids), about its normal (blades), shift along its axes (drawers), and shift
-    it onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
+    They turn about its edges (doors, lids), about its normal (blades), leave it where it is, shift along its axes (drawers),
+    and shift it onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
     """
     center = points.mean(0)
     apart = points - center

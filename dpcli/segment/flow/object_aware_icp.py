@@ -9,6 +9,8 @@ from dpcli.ops import rigid_flow, weighted_kabsch
 from dpcli.ops.backend import chosen_backend, run_in_threads
 from dpcli.segment.network.slot_matching import match_slots, permute_slots
 
+_TEMPERATURE = 0.01  # diameters
+
 
 @torch.no_grad()
 def object_aware_icp(
@@ -18,7 +20,6 @@ def object_aware_icp(
     mask2: Tensor,  # [B, M, S]
     flow: Tensor,  # [B, N, 3]
     iterations: int = 20,
-    temperature: float = 0.01,
     order: Tensor | None = None,  # [B, S]
 ) -> tuple[Tensor, Tensor, Tensor]:  # [B, N, 3], [B, S, 3, 3], [B, S, 3]
     """Returns refined flow (B,N,3) and the motions (B,S,3,3), (B,S,3) of frame 1's slots, from a first flow.
@@ -26,8 +27,8 @@ def object_aware_icp(
     Frame 2's slots are matched once (`order`: `match_slots`, if it is known already). In each iteration point i moved
     by its flow corresponds to points n with weights softmax(-|p_i + f_i - q_n| / temperature) times the probability of
     being in the same part, sum_s m1_is m2_ns; then each slot takes its weighted Kabsch motion, and the flow is their
-    blend. A point whose part has no point in frame 2 keeps its correspondence of before. temperature is in units of
-    length. Memory: (B,N,M). No iterations: the weighted Kabsch of the first flow. Backends: a numba kernel on CPU in
+    blend. A point whose part has no point in frame 2 keeps its correspondence of before. The temperature is 0.01
+    diameters. Memory: (B,N,M). No iterations: the weighted Kabsch of the first flow. Backends: a numba kernel on CPU in
     float32, else torch; equal up to rounding.
     """
     order = match_slots(points1, flow, mask1, points2, mask2) if order is None else order
@@ -35,7 +36,7 @@ def object_aware_icp(
     lost = same_part.amax(-1, keepdim=True) == -torch.inf
     same_part.masked_fill_(lost, 0.0)
     for _ in range(iterations):
-        flow = torch.where(lost, flow, soft_match(points1 + flow, points2, same_part, temperature) - points1)
+        flow = torch.where(lost, flow, soft_match(points1 + flow, points2, same_part, _TEMPERATURE) - points1)
         rotation, translation = weighted_kabsch(points1, points1 + flow, mask1)
         flow = rigid_flow(points1, mask1, rotation, translation)
     if iterations == 0:

@@ -16,6 +16,7 @@ import numpy as np
 from dpcli.segment.flow import motion_proposals
 from dpcli.segment.flow.icp_kernels import assign_kernel, energy_kernel
 from dpcli.segment.flow.surface_icp import Surface
+from dpcli.segment.rigid_motions import compose, move, move_each
 
 _IDENTITY = np.eye(3, 4)
 
@@ -118,10 +119,8 @@ class _BodyFinder:
         region = np.flatnonzero(bodies.label == k)
         if len(region) < 8:
             return np.zeros((0, 3, 4))
-        points = self.points[region] @ bodies.motion[0, :, :3].T + bodies.motion[0, :, 3]
-        first = motion_proposals.compose_motions(
-            motion_proposals.propose_motions(points, np.zeros((0, 3))), bodies.motion[0]
-        )
+        points = move(bodies.motion[0], self.points[region])
+        first = compose(motion_proposals.propose_motions(points, np.zeros((0, 3))), bodies.motion[0])
         ends, score = self._improve(region, first)
         chosen = motion_proposals.choose_distinct(ends, score, self.points[region], 0.03, self.options.kept)
         return ends[[h for h in chosen if score[h] < 0.6]]
@@ -230,7 +229,7 @@ class _BodyFinder:
         They come from ICP of the region from every start of `motion_proposals`.
         """
         own = now.motion[now.label]
-        moved = np.einsum("nij,nj->ni", own[:, :, :3], self.points) + own[:, :, 3]
+        moved = move_each(own, self.points)
         normals = np.einsum("nij,nj->ni", own[:, :, :3], self.source.normals)
         seen = self._saturate(self.target.covered_by(moved, normals, self.options.share))
         lonely = motion_proposals.find_patch_centers(self.target.points[seen > 0.5])
@@ -238,9 +237,7 @@ class _BodyFinder:
         proposals = []
         for region in self._find_bad_regions(current):
             body = np.bincount(now.label[region]).argmax()
-            first = motion_proposals.compose_motions(
-                motion_proposals.propose_motions(moved[region], lonely), now.motion[body]
-            )
+            first = compose(motion_proposals.propose_motions(moved[region], lonely), now.motion[body])
             ends, score = self._improve(region, first)
             gain = score - current[region].mean()
             for h in motion_proposals.choose_distinct(ends, gain, self.points[region], 0.03, self.options.kept):

@@ -55,9 +55,7 @@ def rigid_groups(
         own = torch.where(open_[:, None], own, torch.inf)
         cost = torch.minimum(cost, own)
         chosen.append(own)
-    return (
-        _labels(points, torch.stack(chosen, 1), bound) if chosen else torch.zeros(points.shape[:2], dtype=torch.int64)
-    )
+    return _labels(points, torch.stack(chosen, 1), bound) if chosen else torch.zeros_like(cost, dtype=torch.int64)
 
 
 def _hypotheses(points: Tensor, moved: Tensor, seeds: int) -> tuple[tuple[Tensor, Tensor], Tensor]:

@@ -18,7 +18,7 @@ from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.config import FlowConfig, FlowSchedule
 from dpcli.segment.flow.flowstep3d import FlowStep3D
 from dpcli.segment.flow.losses import flow_loss
-from dpcli.segment.flow.model_file import augment_pair, save_flow_model
+from dpcli.segment.flow.model_file import save_flow_model
 from dpcli.segment.frame_pairs import PairSource
 from dpcli.segment.sequence_splits import hold_out_sequences
 from dpcli.store import CloudsReader
@@ -173,3 +173,16 @@ class FlowTrainer:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.folder.tell_continuing(f"step {self.step + 1} of {self.steps}" if self.step < self.steps else None)
+
+
+def augment_pair(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns a training pair f32 (2,N,3) changed at random, as FlowStep3D is trained on SAPIEN.
+
+    Both frames are scaled by 0.95 to 1.05 per axis, turned by at most 10 degrees about y and shifted by at most 0.05; the
+    second is shifted by at most 0.01 more.
+    """
+    angle = rng.uniform(-np.pi / 18, np.pi / 18)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    changed = (points * rng.uniform(0.95, 1.05, 3)) @ turn.T + rng.uniform(-0.05, 0.05, 3)
+    changed[1] += rng.uniform(-0.01, 0.01, 3)
+    return changed.astype(np.float32)

@@ -16,10 +16,7 @@ from dpcli.store.joints import REVOLUTE
 _TOUCHING = 1.5, 2.0, 3.0  # spacings between points that touch: the least by which enough do
 _FEWEST, _ENOUGH = 4, 8  # points that lie along a line, and along one that is sure
 _MOST, _PLACES = 64, 512  # points of the child in a frame that are turned; places where it touches that are looked at
-_ANGLES = (
-    np.radians(np.arange(-180, 180, 10)),
-    np.radians([-7.5, -5, -2.5, 0, 2.5, 5, 7.5]),
-)  # all around, then near the best
+_ANGLES = np.radians(np.arange(-180, 180, 10)), np.radians(np.arange(-7.5, 8, 2.5))  # all around, then near the best
 
 
 def contact_hinge(child: list[np.ndarray], parent: list[np.ndarray], spacing: float) -> JointFit | None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dpcli.ops.rotations import rotation_matrix, rotation_vector
-from dpcli.segment.kinematics.part_trajectories import moved
 from dpcli.segment.kinematics.registration import Registration, motion_twist, twist_motion
+from dpcli.segment.rigid_motions import move
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE
 
 _RARE = 6.0  # 2 ln 20: parts that move against each other nearly always do so by a hinge or a slide
@@ -42,7 +42,7 @@ def fit_joint(seen: Registration, directions: np.ndarray | None = None) -> Joint
     directions f64 (D,3): of the parts' surfaces; an axis along one of them costs no parameters but the choice.
     """
     points = seen.center + seen.size * np.concatenate([np.eye(3), -np.eye(3)])
-    target = moved(seen.motion, points)
+    target = move(seen.motion, points)
     first = [_fit_fixed(target, points), *nearest_joints(seen.motion, points)]
     tried = [_weighed(seen, fit, points) for fit in first]
     for fit in first[1:]:
@@ -95,7 +95,7 @@ def _weighed(seen: Registration, start: JointFit, points: np.ndarray, choice: fl
     steps = len(value) - 1
     parameters = count - 6 + (0 if start.kind == FIXED else steps)
     length = 2 * solved.cost + parameters * np.log(max(6 * steps, 2)) + (choice or 0.0)
-    residual = _residual(moved(joint_motion(start.kind, axis, point, value), points), moved(seen.motion, points))
+    residual = _residual(move(joint_motion(start.kind, axis, point, value), points), move(seen.motion, points))
     return JointFit(start.kind, axis, point, value, residual, float(length + (_RARE if start.kind == FIXED else 0.0)))
 
 
@@ -118,7 +118,7 @@ def _at_best_value(
 
 def nearest_joints(motion: np.ndarray, points: np.ndarray) -> list[JointFit]:
     """Returns the slide and the hinge that take points (M,3) nearest to where motions f64 (T,4,4) do."""
-    target = moved(motion, points)
+    target = move(motion, points)
     return [_fit_prismatic(target, points), _fit_revolute(motion, target, points)]
 
 

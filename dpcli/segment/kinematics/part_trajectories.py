@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.segment.rigid_motions import bring_to_rest, move
 from dpcli.store import CloudSequence, PartsSample
 
 _ROUNDS = 20  # of averaging; it settles in a few
@@ -54,12 +55,14 @@ def _frames_of(values: np.ndarray, sequence: CloudSequence) -> list[np.ndarray]:
 
 
 def _along_fewest_pairs(sequence: CloudSequence, edges: list, parts: int) -> np.ndarray:
-    motion = np.tile(np.eye(4), (sequence.num_frames, parts, 1, 1))
+    motion, leading = np.tile(np.eye(4), (sequence.num_frames, parts, 1, 1)), defaultdict(list)
+    for source, target, step in edges:
+        leading[source].append((target, step))
     reached, queue = {0}, deque([0])
     while queue:
         here = queue.popleft()
-        for source, target, step in edges:
-            if source == here and target not in reached:
+        for target, step in leading[here]:
+            if target not in reached:
                 motion[target] = step @ motion[here]
                 reached.add(target)
                 queue.append(target)
@@ -95,19 +98,10 @@ def _disagreement(
         points = points_at_start(sequence, int(part), motion[:, k], 64)
         for source, target, step in edges:
             if seen[source, k] and seen[target, k]:
-                gap = moved(step[k] @ motion[source, k], points) - moved(motion[target, k], points)
+                gap = move(step[k] @ motion[source, k], points) - move(motion[target, k], points)
                 squares[k] += (gap**2).sum(1).mean()
                 count[k] += 1
     return np.sqrt(squares / np.maximum(count, 1))
-
-
-def moved(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns points (N,3) after motions (...,4,4), f64 (...,N,3).
-
-    >>> moved(np.eye(4), np.ones((1, 3))).tolist()
-    [[1.0, 1.0, 1.0]]
-    """
-    return points @ np.swapaxes(motion[..., :3, :3], -1, -2) + motion[..., None, :3, 3]
 
 
 def points_at_start(sequence: CloudSequence, part: int, motion: np.ndarray, most: int | None = None) -> np.ndarray:
@@ -118,7 +112,7 @@ def points_at_start(sequence: CloudSequence, part: int, motion: np.ndarray, most
     clouds = []
     for t, (points, ids) in enumerate(zip(_frames_of(sequence.points, sequence), _frames_of(sequence.part, sequence))):
         own = points[ids == part].astype(np.float64)
-        clouds.append((own - motion[t, :3, 3]) @ motion[t, :3, :3])  # the inverse of a rigid motion
+        clouds.append(bring_to_rest(own, motion[t]))
     joined = np.concatenate(clouds)
     if most is not None and len(joined) > most:
         joined = joined[np.linspace(0, len(joined) - 1, most).astype(int)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from dpcli.ops.rotations import motion_matrix, rotation_matrix, rotation_vector
 from dpcli.segment.flow.surface_icp import Surface, columns
+from dpcli.segment.rigid_motions import bring_to_rest
 
 _SAMPLES = 12  # halves of the points that are registered anew
 _FRAMES = 12  # of a part that are registered; others are known as surely as the nearest of these
@@ -43,7 +44,7 @@ def register(clouds: list[np.ndarray], motion: np.ndarray, rng: np.random.Genera
     points go onto half of all others' (the variance of estimates from halves is that of the whole's, Shao and Wu 1989); what
     slides along itself, such as a cap that turns about its own axis, so shows that its motion can't be known.
     """
-    back = [(cloud - m[:3, 3]) @ m[:3, :3] for cloud, m in zip(clouds, motion)]
+    back = [bring_to_rest(cloud, m) for cloud, m in zip(clouds, motion)]
     joined = np.concatenate(back)
     center, size = joined.mean(0), max(float(np.sqrt(joined.var(0).sum())), 1e-9)
     unit = [_some((cloud - center) / (2 * size), _MOST, rng) for cloud in back]
@@ -94,9 +95,8 @@ def relative_registration(parent: Registration, child: Registration) -> Registra
     motion = np.linalg.inv(parent.motion) @ child.motion
     x, y, z = np.moveaxis(motion[:, :3, :3] @ child.center + motion[:, :3, 3] - parent.center, -1, 0)
     none = np.zeros_like(x)
-    arm = np.stack([none, z, -y, -z, none, x, y, -x, none], -1).reshape(
-        -1, 3, 3
-    )  # turns a rotation into a shift at the child
+    # turns a rotation into a shift at the child
+    arm = np.stack([none, z, -y, -z, none, x, y, -x, none], -1).reshape(-1, 3, 3)
     back = np.swapaxes(motion[:, :3, :3], 1, 2)
     seen = np.zeros((len(motion), 6, 6))
     seen[:, :3, :3] = seen[:, 3:, 3:] = back

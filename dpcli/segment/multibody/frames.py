@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.multibody.label_kernels import alike_kernel, displacement_kernel, gain_kernel, row_length
 from dpcli.segment.multibody.visibility import DepthMap
+from dpcli.segment.rigid_motions import bring_to_rest, compose, motion_between, move
 
 _PARTNERS = 6  # other frames that a point is compared with, so that the cost stays linear in frames
 POINT_SHARE = 0.15  # of point-to-point distance in a residual, besides point to plane
@@ -53,11 +54,13 @@ class Frames:
         """Returns where the points of frame t lie among all N."""
         return slice(int(self.starts[t]), int(self.starts[t + 1]))
 
+    def points_of(self, inside: np.ndarray) -> list[np.ndarray]:
+        """Returns the points (n_t,3) of a mask (N) in each frame."""
+        return [self.points[own][inside[own]] for own in map(self.slice, range(len(self)))]
+
     def motions(self, trajectory: Trajectory) -> np.ndarray:
         """Returns the motions (F,P,3,4) of a trajectory from every frame to its partners."""
-        first, second = trajectory[:, None], trajectory[self.partners]
-        turn = second[..., :3] @ first[..., :3].swapaxes(-1, -2)
-        return np.concatenate([turn, second[..., 3:] - turn @ first[..., 3:]], -1)
+        return motion_between(trajectory[:, None], trajectory[self.partners])
 
     def explain(self, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
         """Returns costs f32 (N), 0..1, of all points under one trajectory, and the nearest points i32 (N,partners).
@@ -106,7 +109,7 @@ class Frames:
         own: onto the body's own points only, not onto the whole frame. tight: last residual of the ICP, in spacings.
         """
         trajectory = trajectory.copy()
-        points = [self.points[self.slice(t)][inside[self.slice(t)]] for t in range(len(self))]
+        points = self.points_of(inside)
         at_rest = [bring_to_rest(cloud, motion) for cloud, motion in zip(points, trajectory)]
         for u in range(len(self)):
             source = move(trajectory[u], np.concatenate([at_rest[t] for t in self.partners[u]]))
@@ -133,21 +136,4 @@ def choose_partners(t: int, frames: int) -> list[int]:
 
 def relative_motion(trajectory: Trajectory, t: int, u: int) -> np.ndarray:
     """Returns the motion (3,4) from frame t to frame u."""
-    rotation = trajectory[u, :, :3] @ trajectory[t, :, :3].T
-    return np.concatenate([rotation, (trajectory[u, :, 3] - rotation @ trajectory[t, :, 3])[:, None]], 1)
-
-
-def compose(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Returns the motion (3,4) that makes `before` and then `after`."""
-    shift = after[:, :3] @ before[:, 3] + after[:, 3]
-    return np.concatenate([after[:, :3] @ before[:, :3], shift[:, None]], 1)
-
-
-def bring_to_rest(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Returns points (n,3) in a body's own coordinates, from which a motion (3,4) takes them to where they are."""
-    return (points - motion[:, 3]) @ motion[:, :3]
-
-
-def move(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns points (n,3) moved by a motion (3,4)."""
-    return points @ motion[:, :3].T + motion[:, 3]
+    return motion_between(trajectory[t], trajectory[u])

@@ -9,7 +9,8 @@ import numpy as np
 
 from dpcli.segment.flow.rigid_bodies import BodySearch, find_surface_bodies
 from dpcli.segment.flow.surface_icp import columns
-from dpcli.segment.multibody.frames import POINT_SHARE, Frames, Trajectory, compose, move, relative_motion
+from dpcli.segment.multibody.frames import POINT_SHARE, Frames, Trajectory
+from dpcli.segment.rigid_motions import compose, motion_between, move
 
 _ALL_PAIRS = 4  # frames up to which all ordered pairs are searched; beyond, adjacent ones both ways
 _STEPS, _WIDE = 12, 0.06  # of the ICP that carries a body on
@@ -54,7 +55,7 @@ def _pairs(frames: int) -> list[tuple[int, int]]:
 
 
 def _spread(seeds: list, frames: int) -> list:
-    """Returns at most `_MOST` bodies of the list, so that every frame gives as many of its largest as the others."""
+    """Returns some of the list's bodies: of every frame as many of its largest, of all about twice as many as are kept."""
     each = max(1, 2 * _MOST // frames)
     taken: dict[int, int] = {}
     kept = []
@@ -94,16 +95,13 @@ def keep_different(frames: Frames, found: list[Hypothesis]) -> list[Hypothesis]:
     """Returns the hypotheses, in their order, that take their points elsewhere than all before."""
     kept: list[Hypothesis] = []
     for one in found:
-        if all(_distance(one, other) > _ALIKE * frames.spacing for other in kept):
+        if len(kept) < _MOST and all(_distance(one, other) > _ALIKE * frames.spacing for other in kept):
             kept.append(one)
-    return kept[:_MOST]
+    return kept
 
 
 def _distance(one: Hypothesis, other: Hypothesis) -> float:
     """Returns how far the other's trajectory takes the one's points from its own, on average, in the worst frame."""
     sample, t = one.points[:: max(1, len(one.points) // 24)], one.frame
-    apart = [
-        move(relative_motion(one.trajectory, t, u) - relative_motion(other.trajectory, t, u), sample)
-        for u in range(len(one.trajectory))
-    ]
-    return max(float(np.linalg.norm(gap, axis=1).mean()) for gap in apart)
+    own, others = (motion_between(trajectory[t], trajectory) for trajectory in (one.trajectory, other.trajectory))
+    return float(np.linalg.norm(move(own - others, sample), axis=2).mean(1).max())

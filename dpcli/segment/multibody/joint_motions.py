@@ -9,8 +9,9 @@ import numpy as np
 from dpcli.segment.kinematics.contact_hinge import contact_hinge
 from dpcli.segment.kinematics.joint_fit import JointFit, nearest_joints
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
-from dpcli.segment.multibody.frames import Frames, Trajectory, bring_to_rest, compose
+from dpcli.segment.multibody.frames import Frames, Trajectory
 from dpcli.segment.multibody.point_fit import NUMBER_PRICE, PointFit
+from dpcli.segment.rigid_motions import bring_to_rest, compose, invert
 from dpcli.store.joints import REVOLUTE
 
 _PARENTS = 2  # larger bodies tried, those that it touches most
@@ -57,22 +58,14 @@ def _simplest(frames: Frames, body: Body, inside: np.ndarray, parents: list[tupl
 
 def _at_rest(frames: Frames, inside: np.ndarray, trajectory: Trajectory) -> list[np.ndarray]:
     """Returns the points of a mask, of each frame, in the coordinates of a body."""
-    return [
-        bring_to_rest(frames.points[own][inside[own]], motion)
-        for own, motion in zip(map(frames.slice, range(len(frames))), trajectory)
-    ]
+    return [bring_to_rest(own, motion) for own, motion in zip(frames.points_of(inside), trajectory)]
 
 
 def _first_joints(frames: Frames, trajectory: Trajectory, inside: np.ndarray, parent: Trajectory) -> list[JointFit]:
     """Returns the slide and the hinge nearest to a body's motion since frame 0, in the parent's own coordinates."""
-    child = np.stack([compose(_inverse(p), c) for p, c in zip(parent, trajectory)])
+    child = compose(invert(parent), trajectory)
     motion = np.tile(np.eye(4), (len(child), 1, 1))
-    motion[:, :3] = [compose(one, _inverse(child[0])) for one in child]
-    first = frames.points[frames.slice(0)][inside[frames.slice(0)]]
-    points = (first - parent[0, :, 3]) @ parent[0, :, :3]
+    motion[:, :3] = compose(child, invert(child[0]))
+    points = bring_to_rest(frames.points_of(inside)[0], parent[0])
     center, size = points.mean(0), max(float(np.sqrt(points.var(0).sum())), frames.spacing)
     return nearest_joints(motion, center + size * np.concatenate([np.eye(3), -np.eye(3)]))
-
-
-def _inverse(motion: np.ndarray) -> np.ndarray:
-    return np.concatenate([motion[:, :3].T, -(motion[:, :3].T @ motion[:, 3])[:, None]], 1)

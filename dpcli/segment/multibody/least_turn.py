@@ -8,7 +8,8 @@ import numpy as np
 
 from dpcli.ops.rotations import rotation_matrix, rotation_vector
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
-from dpcli.segment.multibody.frames import Frames, Trajectory, compose, move, relative_motion
+from dpcli.segment.multibody.frames import Frames, Trajectory, relative_motion
+from dpcli.segment.rigid_motions import compose, move
 
 _AS_GOOD = 0.02  # cost of a point by which two motions of a body may differ by chance of the points drawn
 _CLEARLY = 0.05  # radians by which another motion must turn less

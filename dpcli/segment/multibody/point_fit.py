@@ -10,6 +10,7 @@ from dpcli.ops.rotations import rotation_matrix, rotation_vector
 from dpcli.segment.flow.surface_icp import columns
 from dpcli.segment.kinematics.joint_fit import JointFit
 from dpcli.segment.multibody.frames import Frames, Trajectory
+from dpcli.segment.rigid_motions import compose, motion_between
 from dpcli.store.joints import REVOLUTE
 
 NUMBER_PRICE = 1.5  # costs of a point that each number of a motion must save
@@ -47,9 +48,7 @@ class PointFit:
 
     def _points(self, inside: np.ndarray) -> tuple[list[np.ndarray], float]:
         """Returns a part's points (3,n) of each frame, and its size in the first."""
-        points = [
-            self.frames.points[self.frames.slice(t)][inside[self.frames.slice(t)]] for t in range(len(self.frames))
-        ]
+        points = self.frames.points_of(inside)
         size = float(np.sqrt(points[0].var(0).sum())) if len(points[0]) else 0.0
         return [columns(own) for own in points], max(size, self.frames.spacing)
 
@@ -94,7 +93,7 @@ class PointFit:
             motion[..., 3] = point[:, None] - (motion[..., :3] @ point[:, None, :, None])[..., 0]
         else:
             motion[..., :3], motion[..., 3] = np.eye(3), value[..., None] * axis[:, None]
-        return parent, _composed(parent, motion)
+        return parent, compose(parent, motion)
 
     def _step(self, scale: float) -> np.ndarray:
         """Returns the step of Gauss-Newton, in the numbers of `_moved`."""
@@ -105,14 +104,19 @@ class PointFit:
         for points, before, after in zip((self._moving, self._child), now, nudged, strict=True):
             if points is None:
                 continue
-            motion = _relative(before, *self._pairs)[0]
+            motion = self._between_pairs(before)[0]
             matrix, vector, center = self._linearized(points, motion, scale)
-            slope = _twists(_relative(after, *self._pairs), motion, center) / _NUDGE
+            slope = _twists(self._between_pairs(after), motion, center) / _NUDGE
             weighed = np.einsum("npi,pij->npj", slope, matrix)
             total += weighed.reshape(count, -1) @ slope.reshape(count, -1).T
             right += slope.reshape(count, -1) @ vector.ravel()
         total[np.diag_indices(count)] += 1e-6 * np.trace(total) / count + 1e-9
         return np.linalg.solve(total, right)
+
+    def _between_pairs(self, trajectory: np.ndarray) -> np.ndarray:
+        """Returns the motions (n,P,3,4) between all pairs of frames of trajectories (n,T,3,4)."""
+        source, target = self._pairs
+        return motion_between(trajectory[:, source], trajectory[:, target])
 
     def _linearized(
         self, points: list[np.ndarray], motion: np.ndarray, scale: float
@@ -133,19 +137,7 @@ def _twisted(parent: np.ndarray, twist: np.ndarray, points: list[np.ndarray], si
     step = np.zeros((*twist.shape[:2], 3, 4))
     step[..., :3] = rotation_matrix(twist[..., :3])
     step[..., 3] = middle + size * twist[..., 3:] - (step[..., :3] @ middle[..., None])[..., 0]
-    return np.concatenate([parent[:, :1], _composed(step, parent[:, 1:])], 1)
-
-
-def _composed(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    turn = after[..., :3]
-    return np.concatenate([turn @ before[..., :3], turn @ before[..., 3:] + after[..., 3:]], -1)
-
-
-def _relative(trajectory: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Returns the motions (n,P,3,4) between pairs of frames of trajectories (n,T,3,4)."""
-    first, second = trajectory[:, source], trajectory[:, target]
-    turn = second[..., :3] @ np.swapaxes(first[..., :3], -1, -2)
-    return np.concatenate([turn, second[..., 3:] - turn @ first[..., 3:]], -1)
+    return np.concatenate([parent[:, :1], compose(step, parent[:, 1:])], 1)
 
 
 def _twists(after: np.ndarray, before: np.ndarray, center: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from dpcli.segment.multibody.frames import relative_motion
 from dpcli.segment.multibody.search import explain_sequence
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import Tracks, follow_tracks, parts_of_tracks
-from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.segment.segmenters import Segmenter
 
 _TEMPERATURE = 0.2  # of masks, in costs of a point
 _LEAST_TRUST = 0.01  # of a body that some frame doesn't show: above 0, since the likeliest body of a mask is the part
@@ -30,16 +29,11 @@ class MultibodySegmenter(Segmenter):
 
     settings: MultibodySettings
     by_tracks: bool = True
-    needs_flows: ClassVar[bool] = False
 
     @property
     def slots(self) -> int:
         """Returns the most bodies of a sequence."""
         return self.settings.most_bodies
-
-    def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Returns the masks of `explain` alone."""
-        return self.explain(frames, [])[0]
 
     def explain(
         self,

@@ -8,7 +8,8 @@ import numpy as np
 
 from dpcli.segment.flow.motion_proposals import cluster_patches
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
-from dpcli.segment.multibody.frames import Frames, Trajectory, bring_to_rest
+from dpcli.segment.multibody.frames import Frames, Trajectory
+from dpcli.segment.rigid_motions import bring_to_rest
 
 _PATCHES = (2, 4)  # that a body is divided into
 _FEWEST = 12  # points of a patch in a frame, on average

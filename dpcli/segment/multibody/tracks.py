@@ -8,6 +8,7 @@ import numpy as np
 
 from dpcli.ops.rigid_parts import find_parts
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.rigid_motions import move_each
 
 _PATCHES = 300  # that are joined to parts; the smallest part is one of them
 _SOFT = 0.02  # the setting `flexible` at which parts bend as animals' skin does
@@ -74,8 +75,7 @@ def _carried(before: np.ndarray, now: np.ndarray, both: np.ndarray, missing: np.
         return before[missing]
     start, end = before[both], now[both]
     near = cKDTree(start).query(before[missing], min(_AROUND, len(start)))[1].reshape(missing.sum(), -1)
-    motion = fit_motions(start[near], end[near])
-    return np.einsum("mij,mj->mi", motion[:, :, :3], before[missing]) + motion[:, :, 3]
+    return move_each(fit_motions(start[near], end[near]), before[missing])
 
 
 def fit_motions(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:

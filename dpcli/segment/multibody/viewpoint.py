@@ -6,8 +6,9 @@ import numpy as np
 
 from dpcli.segment.flow.surface_icp import columns
 from dpcli.segment.multibody.explanation import Explanation
-from dpcli.segment.multibody.frames import POINT_SHARE, Frames, move
+from dpcli.segment.multibody.frames import POINT_SHARE, Frames
 from dpcli.segment.multibody.visibility import DepthMap
+from dpcli.segment.rigid_motions import move
 
 _DIRECTIONS = 100  # tried, some 20 degrees apart
 _DISTANCES = (2.0, 1.5, 3.0, 6.0)  # diameters from the middle of all points

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.ops.cpu.jit import inlined, kernel
-from dpcli.segment.flow.motion_proposals import compose_motions
+from dpcli.segment.rigid_motions import compose, move
 
 _HIDDEN_COST = 0.5  # of a hidden point at most: between what is explained (some 0.2) and what isn't (1)
 _BEHIND = 1.5  # spacings that a hidden point lies behind all that is seen there
@@ -39,7 +39,7 @@ class DepthMap:
     @classmethod
     def of(cls, points: np.ndarray, camera: np.ndarray, spacing: float) -> DepthMap:
         """Returns the depth map of points (N,3); those that are not ahead of the camera are left out."""
-        place = points @ camera[:, :3].T + camera[:, 3]
+        place = move(camera, points)
         place = place[place[:, 2] > spacing]
         if not len(place):
             nowhere = np.full((1, 1), np.inf, np.float32)
@@ -65,7 +65,7 @@ class DepthMap:
         Of these the cost f32 (n) is no more than `_HIDDEN_COST`, and if it was, the point itself, `start` plus its index, is
         in `nearest` i32 (n), so that its label needs no support from this frame.
         """
-        camera = compose_motions(self.camera, motion)
+        camera = compose(self.camera, motion)
         hide_kernel(
             points, camera, self.per_cell, self.first, self.far, self.margin, _HIDDEN_COST, start, cost, nearest
         )

@@ -41,8 +41,8 @@ def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
     total = {"neighbor_sums": 0, "spatial": 0, "group": 0, "shortcut": 0}
     channels, here = 1, points
     for layer in (layer for block in config.layers for layer in block):
+        count = layer.neighbors if config.rule == "first" else min(layer.neighbors, here)  # the former repeats points
         here = -(-here // layer.stride)
-        count = min(layer.neighbors, points)
         sums = len(kernel.orbit) * count if channels == 1 else positions * count * rotations * channels
         total["neighbor_sums"] += here * sums
         total["spatial"] += here * rotations * positions * channels * layer.channels

@@ -55,9 +55,14 @@ class PartNetwork(nn.Module):
         features = self.motion.part_features(frames.level.equivariant, frames.level.points, coarse)
         return self.motion(*features.chunk(2))
 
-    def motions(self, points: Tensor, frames: FrameParts, matched: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns every part's rotation (B,S,3,3) and translation (B,S,3) from frames 1 to 2; arguments as `pair`."""
-        candidates = self.motion.candidates(*self.pair(points, frames, matched))
+    def motions(
+        self, points: Tensor, frames: FrameParts, matched: Tensor, answer: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Returns every part's rotation (B,S,3,3) and translation (B,S,3) from frames 1 to 2.
+
+        answer: what `pair` gives for the other arguments.
+        """
+        candidates = self.motion.candidates(*answer)
         coarse = self._coarse_mask(points, frames, matched)
         shift = (points.mean(1) if self.config.canonical_heads else points.new_zeros(len(points), 3))[:, None]
         places = frames.level.points + shift

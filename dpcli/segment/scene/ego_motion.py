@@ -8,15 +8,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dpcli.ops.open3d_import import load_open3d
+from dpcli.segment.rigid_motions import move
 
 _SCALES = ((1.0, 3.0), (0.5, 1.2), (0.3, 0.5))  # voxel and farthest partner, meters
 _STEP = 2.5  # meters between the starts of the search
 _STEPS = {0: 20, 1: 20, 2: 30}
 _BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
 _DIGITS = 9  # of a motion that are kept: Open3D adds in the order in which threads end, and the last digits differ
-_ACROSS = (
-    0.08  # mean square of the normals along the level direction that they show least, from which on it is shown well
-)
+_ACROSS = 0.08  # mean square of the normals along the level direction that they show least, if they show it well
 _NEAR = 0.5  # meters: a point this near to the other frame's has a partner
 OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
 
@@ -96,7 +95,7 @@ def _misfit(source, target, tree: cKDTree, motion: np.ndarray) -> tuple[float, f
     To the surface, because the beams move with the sensor: their rings on the ground and on walls lie on one another where
     no motion is assumed.
     """
-    moved = np.asarray(source.points) @ motion[:3, :3].T + motion[:3, 3]
+    moved = move(motion, np.asarray(source.points))
     distance, partner = tree.query(moved, distance_upper_bound=2 * _NEAR)
     met = np.isfinite(distance)
     partner = partner[met]

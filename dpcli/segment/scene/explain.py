@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.ego_motion import OVERLAP, register_frames, shows_the_way
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
 from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
-from dpcli.segment.scene.tracking import MovingObject, extended, moved
+from dpcli.segment.scene.tracking import MovingObject, extended
 from dpcli.segment.scene.world import Frame, World
 
 _SURE = 50.0  # points explained better that make an object two thirds surer
 _FEWEST = 50  # points of a frame that shows anything of a scene
-_FAR = 40.0  # meters: a sensor has some point nearer than this
+SENSOR_NEAR = 40.0  # meters: a sensor has some point nearer than this
 _JUMPS = 0.12  # share of neighboring beams that may end at different ranges, seen from where the sensor was
 
 
@@ -104,7 +105,7 @@ def _build_world(
     run = np.concatenate([[0], np.cumsum(overlap < OVERLAP)])
     world = [
         Frame(
-            moved(frame, pose),
+            move(pose, frame),
             height,
             None if eye is None else pose[:3, :3] @ (turn[:3, :3] @ eye) + pose[:3, 3],
             settings.ground,
@@ -117,4 +118,4 @@ def _build_world(
 
 def _may_be_sensor(points: np.ndarray, place: np.ndarray) -> bool:
     """Returns whether a frame looks as if taken from a place (3): neighboring beams mostly end at about the same range."""
-    return bool(np.linalg.norm(points - place, axis=1).min() < _FAR and range_jumps(points, place) < _JUMPS)
+    return bool(np.linalg.norm(points - place, axis=1).min() < SENSOR_NEAR and range_jumps(points, place) < _JUMPS)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.clusters import cluster, groups
 from dpcli.segment.scene.object_motion import refine, search_velocity
 from dpcli.segment.scene.settings import SceneSettings
-from dpcli.segment.scene.tracking import MovingObject, claim_around, merge_alike, moved, track
+from dpcli.segment.scene.tracking import MovingObject, claim_around, merge_alike, track
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _FEWEST = 6  # points of an object in the frame that proposes it
@@ -100,7 +101,7 @@ def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings, dem
     best, least = {}, float(np.mean([world.frames[u].cost(points)[0].mean() for u in near]))
     for start in search_velocity(points, t, around, world, settings.travel):
         motions = {u: refine(points, world.frames[u], _shift(start * (u - t))) for u in near}
-        cost = np.mean([world.frames[u].cost(moved(points, motion))[0].mean() for u, motion in motions.items()])
+        cost = np.mean([world.frames[u].cost(move(motion, points))[0].mean() for u, motion in motions.items()])
         if cost < least:
             best, least = motions, float(cost)
     one = MovingObject(t, {t: own}, {t: np.eye(4)}, demand=demand)
@@ -146,7 +147,7 @@ def _costs(one: MovingObject, t: int, world: World) -> tuple[np.ndarray, np.ndar
     for u in others:
         cost, seen = world.frames[u].cost(points)
         still += cost / len(others)
-        moving += world.frames[u].cost(moved(points, one.between(t, u)))[0] / len(others)
+        moving += world.frames[u].cost(move(one.between(t, u), points))[0] / len(others)
         free += seen / len(others)
     return still, moving, free
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.world import Frame, World
 
 _CELL = 0.2  # meters, of the map of distances
@@ -28,11 +29,10 @@ def search_velocity(points: np.ndarray, t: int, others: list[int], world: World,
     fine = np.arange(-0.5, 0.51, 0.05)
     steps = np.concatenate([np.stack(np.meshgrid(a, a), -1).reshape(-1, 2) for a in (coarse, fine)])
     steps = steps[np.hypot(steps[:, 0], steps[:, 1]) <= reach]
-    total, count = np.zeros(len(steps)), np.zeros(len(steps))
+    total = np.zeros(len(steps))
     for u in others:
         total += _displaced_cost(points, steps * (u - t), world.frames[u].solid, reach * min(abs(u - t), 2))
-        count += 1
-    order, chosen = np.argsort(total / np.maximum(count, 1), kind="stable"), []
+    order, chosen = np.argsort(total, kind="stable"), []
     for place in order:
         if all(np.linalg.norm(steps[place] - one) > 0.4 for one in chosen):
             chosen.append(steps[place])
@@ -65,7 +65,7 @@ def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
     Objects stay level: they turn about the upright axis only, and only where they are large enough to show it.
     """
     points = points[np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)]
-    motion, moved = start.copy(), points @ start[:3, :3].T + start[:3, 3]
+    motion, moved = start.copy(), move(start, points)
     middle, radius = (moved.min(0) + moved.max(0)) / 2, np.linalg.norm(np.ptp(moved, axis=0)) / 2 + _CUTS[0]
     target = frame.solid[frame.tree.query_ball_point(middle, radius)] if len(frame.solid) else frame.solid
     target = target[np.all((target > moved.min(0) - _CUTS[0]) & (target < moved.max(0) + _CUTS[0]), axis=1)]
@@ -80,7 +80,7 @@ def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
             if step is None or abs(_angle(step @ motion) - _angle(start)) > _TURN:
                 return motion
             motion = step @ motion
-            before, moved = moved, points @ motion[:3, :3].T + motion[:3, 3]
+            before, moved = moved, move(motion, points)
             if abs(moved - before).max() < 3e-3:
                 break
     return motion

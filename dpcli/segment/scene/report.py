@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.segment.pictures import Look
+from dpcli.segment.scene.explain import SENSOR_NEAR
 from dpcli.segment.scene.ground import find_up
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsReader, PartsSample
@@ -38,7 +39,8 @@ def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> 
     for (i, j), motion in zip(said.pairs.tolist(), said.motion.astype(np.float64)):
         own = sequence.frame(i)[sequence.part[sequence.frame_offsets[i] : sequence.frame_offsets[i + 1]] == part]
         if abs(i - j) == 1 and len(own) and not _same(sequence, i, j):
-            middle = np.append(np.median(own, axis=0), 1.0).astype(np.float64)
+            place = np.median(own, axis=0) if part else _sensor_place(sequence, own, METERS.get(unit, 1.0))
+            middle = np.append(place, 1.0).astype(np.float64)
             moved = np.linalg.solve(motion[0], motion[part] @ middle) if part else motion[0] @ middle
             steps.append(np.linalg.norm((moved - middle)[:3]))
             since = min(i, j)
@@ -50,6 +52,16 @@ def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> 
     step = f"{np.median(steps):.2f} {unit} a frame"
     rate = np.median(np.array(steps) / np.where(np.array(times) > 0, times, np.nan))
     return f"{step} ({rate:.1f} {unit}/s)" if np.isfinite(rate) else step
+
+
+def _sensor_place(sequence: CloudSequence, points: np.ndarray, meters: float) -> np.ndarray:
+    """Returns where the sensor was that saw points (N,3): at the origin, before or after `shift`, if that is near them.
+
+    Else their middle, as of frames in one map's coordinates. meters: in a unit of length.
+    """
+    places = [np.zeros(3)] if sequence.shift is None else [np.zeros(3), -sequence.shift]
+    near = (place for place in places if meters * np.linalg.norm(points - place, axis=1).min() < SENSOR_NEAR)
+    return next(near, np.median(points, axis=0))
 
 
 def _same(sequence: CloudSequence, first: int, second: int) -> bool:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.explain import SceneExplanation, explain_scene
 from dpcli.segment.scene.settings import SceneSettings
-from dpcli.segment.scene.tracking import moved
-from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.segment.segmenters import Segmenter
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
 from dpcli.store.schema import METERS
@@ -32,17 +29,11 @@ class SceneSegmenter(Segmenter):
     """Explains lidar scans and depth images of streets: the sensor's own motion, and objects that move on their own."""
 
     settings: SceneSettings
-    needs_flows: ClassVar[bool] = False
 
     @property
     def slots(self) -> int:
         """Returns how many objects a sequence may have at most, the background included."""
         return self.settings.most_objects + 1
-
-    def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Returns labels as masks of zeros and ones, of frames (N_t,3) in meters seen from their origin."""
-        found = explain_scene([np.float64(frame) for frame in frames], [np.zeros(3)], self.settings)
-        return [torch.nn.functional.one_hot(torch.from_numpy(own), self.slots).float() for own in found.labels]
 
     def explain(
         self, sequence: CloudSequence, pairs: list[tuple[int, int]], length_unit: str
@@ -56,7 +47,7 @@ class SceneSegmenter(Segmenter):
         order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
         to_meters = np.diag([unit, unit, unit, 1.0])
         to_meters[:3, 3] = -unit * np.median(sequence.points, axis=0)
-        clouds = [moved(np.float64(sequence.frame(t)), to_meters) for t in range(count)]
+        clouds = [move(to_meters, np.float64(sequence.frame(t))) for t in range(count)]
         reach = unit * float(np.ptp(sequence.points, axis=0).max())
         if reach > _FARTHEST:
             raise DataError(
@@ -65,7 +56,7 @@ class SceneSegmenter(Segmenter):
             )
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
         seen, place = _without_repeats(clouds, order)
-        found = explain_scene([clouds[t] for t in seen], list(moved(origins, to_meters)), self.settings)
+        found = explain_scene([clouds[t] for t in seen], list(move(to_meters, origins)), self.settings)
         radius = _tell_size(sequence.name, clouds, length_unit)
         if sequence.time is not None and radius > _ROOM:
             self._tell_pace(sequence.name, np.diff(sequence.time[seen]))
@@ -160,5 +151,5 @@ def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) 
     """Returns points f64 (N,3) that follow the motions (K,4,4) of their labels (N)."""
     target = np.empty_like(points)
     for part in np.unique(label):
-        target[label == part] = moved(points[label == part], motions[part])
+        target[label == part] = move(motions[part], points[label == part])
     return target

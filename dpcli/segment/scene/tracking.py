@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import fractional_matrix_power
 from scipy.spatial import cKDTree
 
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.object_motion import refine
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
@@ -47,13 +49,10 @@ class MovingObject:
         return extended(self.motion, target) @ np.linalg.inv(extended(self.motion, source))
 
 
-def moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Returns points f64 (N,3) after a motion (4,4)."""
-    return points @ motion[:3, :3].T + motion[:3, 3]
-
-
 def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
-    """Returns the motion to a frame; to one that is not known, with the nearest step repeated."""
+    """Returns the motion to a frame; to one that is not known, with the nearest step repeated, a part of it a frame where it
+    leads over several.
+    """
     if frame in known or len(known) < 2:
         return known.get(frame, next(iter(known.values())))
     numbers = np.array(sorted(known))
@@ -61,7 +60,7 @@ def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
     inner = int(numbers[np.argsort(np.abs(numbers - edge), kind="stable")[1]])
     step = known[edge] @ np.linalg.inv(known[inner])
     step = step if edge > inner else np.linalg.inv(step)
-    return np.linalg.matrix_power(step, frame - edge) @ known[edge]
+    return fractional_matrix_power(step, (frame - edge) / abs(edge - inner)).real @ known[edge]
 
 
 def track(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -> None:
@@ -74,8 +73,9 @@ def track(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -
             if not _alike(points, before, step, _JERK):
                 one.demand *= _UNSTEADY
                 return
-        members = _members(moved(points, step), there)
-        if len(members) == 0 or (there.cost(moved(points, step))[0] < 0.9 * UNSEEN).mean() < _FOUND:
+        places = move(step, points)
+        members = _members(places, there)
+        if len(members) == 0 or (there.cost(places)[0] < 0.9 * UNSEEN).mean() < _FOUND:
             return
         t += way
         one.motion[t] = step @ one.motion[t - way]
@@ -86,7 +86,7 @@ def _alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, limits: tu
     """Returns whether two motions (4,4) take the corners of the box around points (N,3) to about the same places."""
     low, high = points.min(0), points.max(0)
     corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
-    ways = [moved(corners, motion) - corners for motion in (first, second)]
+    ways = [move(motion, corners) - corners for motion in (first, second)]
     apart = np.linalg.norm(ways[0] - ways[1], axis=1).max()
     return bool(apart <= limits[0] + limits[1] * np.linalg.norm(ways[0].mean(0)))
 
@@ -140,15 +140,10 @@ def merge_alike(found: list[MovingObject], world: World) -> list[MovingObject]:
             continue
         for t, points in one.points.items():
             if t not in whole.points:
-                whole.motion[t] = one.between(one.start, t) @ _bridge(whole, one)
+                whole.motion[t] = one.between(one.start, t) @ extended(whole.motion, one.start)
             whole.points[t] = np.union1d(whole.points.get(t, points[:0]), points)
         whole.saved += one.saved
     return merged
-
-
-def _bridge(whole: MovingObject, one: MovingObject) -> np.ndarray:
-    """Returns the motion f64 (4,4) of the whole from its own start to that of a piece."""
-    return extended(whole.motion, one.start)
 
 
 def _one_body(whole: MovingObject, one: MovingObject, world: World) -> bool:
@@ -159,7 +154,7 @@ def _one_body(whole: MovingObject, one: MovingObject, world: World) -> bool:
         if not len(own) or world.run[t] != world.run[whole.start]:
             return False
         near = min(whole.points, key=lambda u: (abs(u - t), u))
-        body = moved(world.frames[near].points[whole.points[near]], whole.between(near, t))
+        body = move(whole.between(near, t), world.frames[near].points[whole.points[near]])
         if len(body) == 0:
             return False
         points = frame.points[own]
@@ -177,4 +172,4 @@ def _may_follow(points: np.ndarray, motion: np.ndarray, frame: Frame) -> bool:
 
     A side that is seen along its length shows few columns of points, which wander over it and seem to have a speed of their own.
     """
-    return bool(frame.cost(moved(points, motion))[1].mean() <= _THROUGH)
+    return bool(frame.cost(move(motion, points))[1].mean() <= _THROUGH)

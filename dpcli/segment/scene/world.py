@@ -73,13 +73,15 @@ class Frame:
     def cost(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns what it costs this frame, f64 (M) 0..1, that there be surface at places (M,3), and which it sees through."""
         tolerance = self.tolerance(points)
-        distance = self.tree.query(points, distance_upper_bound=float(tolerance.max(initial=_NOISE)))[0]
+        told = 1 if self.sight is not None else 2  # tolerances up to which distances are told apart
+        farthest = told * float(tolerance.max(initial=_NOISE))
+        distance = self.tree.query(points, distance_upper_bound=farthest)[0]
         cost = np.minimum(distance / tolerance, 1.0) ** 2
         far = np.flatnonzero(distance >= tolerance)
         free = np.zeros(len(points), bool)
         cost[far] = UNSEEN
         if self.sight is None:
-            free[far] = distance[far] > 2 * tolerance[far]
+            free[far] = distance[far] >= told * tolerance[far]
         elif len(far):
             free[far] = self.sight.look(points[far], 0.5 * tolerance[far])
         cost[free] = 1.0

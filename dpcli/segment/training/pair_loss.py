@@ -50,8 +50,11 @@ class Outcome:
     flow: Tensor | None = None
 
 
-def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float) -> Outcome:
-    """Returns the loss of a batch with every term that is on at `progress`, the share (0 to 1) of the training that is over."""
+def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float, rng: torch.Generator) -> Outcome:
+    """Returns the loss of a batch with every term that is on at `progress`, the share (0 to 1) of the training that is over.
+
+    rng: of the turns that the invariance is judged by.
+    """
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
@@ -63,16 +66,19 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
     terms: dict[str, Tensor] = {}
     if order is not None and progress >= objective.motion_after:
         matched = _matched(mask.detach(), order)
-        terms["motion"] = objective.motion * _motion(model, batch, frames, matched, rotation)
+        answer = model.pair(batch.points, frames, matched)
+        terms["motion"] = objective.motion * _motion(model, answer, matched, rotation)
         if objective.consensus != "none" and progress >= objective.consensus_after:
-            beta = _consensus(model, batch, frames, order, objective)
+            motions = model.motions(batch.points, frames, matched, answer)
+            beta = _consensus(batch, mask.detach(), order, motions, objective)
     if objective.cold_start and progress < objective.cold_until:
         terms["cold_start"] = objective.cold_start * _cold_start(batch, mask)
     terms["dynamic"] = objective.dynamic * _rigidity(batch, mask, rotation, translation, beta, objective)
     if progress >= objective.smooth_after:
         terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbors(batch.points))
     if objective.invariance:
-        terms["invariance"] = objective.invariance * invariance_loss(mask, model(turn_randomly(batch.points)[0]).mask)
+        turned, _ = turn_randomly(batch.points, rng)
+        terms["invariance"] = objective.invariance * invariance_loss(mask, model(turned).mask)
     loss = torch.stack(list(terms.values())).sum()
     values = {name: float(term.detach()) for name, term in terms.items()}
     if beta is not None:
@@ -122,27 +128,27 @@ def _matched(mask: Tensor, order: Tensor) -> Tensor:
     return torch.cat([mask[:first], permute_slots(mask[first:], order)])
 
 
-def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tensor, rotation: Tensor) -> Tensor:
-    """Returns the motion head's loss against the rotations that flow and masks imply.
+def _motion(model: PartNetwork, answer: tuple[Tensor, Tensor], matched: Tensor, rotation: Tensor) -> Tensor:
+    """Returns the loss of the motion head's answer (`PartNetwork.pair`) against the rotations that flow and masks imply.
 
     Only slots of more than 2 % of the points count.
     """
-    confidence, residual = model.pair(batch.points, frames, matched)
     half = len(matched) // 2
     share = matched.mean(1)
     weight = torch.minimum(share[:half], share[half:])
     weight = torch.where(weight > 0.02, weight, 0.0)
-    return rotation_loss(confidence, residual, rotation[:half], weight, model.motion.group)
+    return rotation_loss(*answer, rotation[:half], weight, model.motion.group)
 
 
 @torch.no_grad()
-def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tensor, objective: Objective) -> Tensor:
+def _consensus(
+    batch: Batch, mask: Tensor, order: Tensor, motions: tuple[Tensor, Tensor], objective: Objective
+) -> Tensor:
     """Returns beta (2B,N,S) of eq. 4.7.
 
-    The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots.
+    motions: the head's, from frames 1 to 2; frames 2 to 1 have their inverse, in frames 2's slots.
     """
-    mask = frames.mask.detach()
-    rotation, translation = model.motions(batch.points, frames, _matched(mask, order))
+    rotation, translation = motions
     back = order.argsort(1)
     inverse = rotation.mT
     inverse_shift = -(inverse @ translation[..., None]).squeeze(-1)
@@ -162,7 +168,7 @@ def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Obje
     """Returns the flow of eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
-    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
+    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, order=both)
     return objective.flow_decay * batch.flow + (1 - objective.flow_decay) * newest
 
 
@@ -170,15 +176,16 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
     """Returns the loss with labels for the masks and the true flow for the motion head."""
     terms = {"mask": supervised_loss(frames.mask, batch.part)}
     if model.motion is not None:
-        truth = torch.nn.functional.one_hot(batch.part.clamp(0, model.config.slots - 1), model.config.slots).float()
-        truth = truth * (batch.part >= 0)[..., None]  # what is unknown moves with no part
+        slots = model.config.slots
+        truth = torch.nn.functional.one_hot(batch.part.clamp(0, slots - 1), slots).float()
+        truth = truth * ((batch.part >= 0) & (batch.part < slots))[..., None]  # others move with none of these parts
         rotation, _ = weighted_kabsch(batch.points, batch.points + batch.flow, truth)
-        terms["motion"] = objective.motion * _motion(model, batch, frames, truth, rotation)
+        terms["motion"] = objective.motion * _motion(model, model.pair(batch.points, frames, truth), truth, rotation)
     loss = torch.stack(list(terms.values())).sum()
     return Outcome(loss, {name: float(term.detach()) for name, term in terms.items()})
 
 
-def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+def turn_randomly(points: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     """Returns each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
     rotation = quaternion_to_matrix(normalize_quaternion(torch.randn(half, 4, generator=rng))).to(points)

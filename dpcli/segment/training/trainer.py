@@ -86,7 +86,8 @@ class Trainer:
 
     def _steps(self) -> int:
         """Returns the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
-        return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch or None)) // self.schedule.batch, 1)
+        count = len(self.training.pairs)
+        return max(min(self.schedule.pairs_per_epoch or count, count) // self.schedule.batch, 1)
 
     def _run_epoch(self, bar: Progress) -> None:
         """Learns from the pairs that are left of the epoch, and saves now and then."""
@@ -132,14 +133,13 @@ class Trainer:
         """Learns from one batch of pairs and keeps their corrected flows; returns the learning rate."""
         loaded = [self.training.load(pair) for pair in pairs]
         batch = self._load_batch(pairs, loaded)
-        rotation = None
+        rotation, rng = None, torch.Generator().manual_seed(torch_seed(self.seed, SegmentStream.TURN, step))
         if self.schedule.augment:
-            rng = torch.Generator().manual_seed(torch_seed(self.seed, SegmentStream.TURN, step))
             batch.points, rotation = turn_randomly(batch.points, rng)
             batch.flow = batch.flow @ rotation.mT
         rate = self.schedule.learning_rate_at(step, steps)
         try:
-            outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
+            outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1), rng)
         except torch.linalg.LinAlgError:  # of motions of masks that are no numbers
             raise self._diverged("the masks are no longer finite", rate) from None
         stepped = self._optimize(outcome.loss, rate)
@@ -238,7 +238,7 @@ class Trainer:
         """Returns the loss on held-out pairs, which chooses the best weights, and the mean Rand index, None without labels.
 
         The loss compares masks with the bodies that the pairs' first flow shows, or with the labels when supervised. The
-        Rand index is for people to watch: nothing is chosen by it.
+        Rand index, of the points whose part is known, is for people to watch: nothing is chosen by it.
         """
         self.model.eval()
         if self.checking is None:
@@ -252,9 +252,9 @@ class Trainer:
             several = bodies.amax(1) > 0
             if several.any():
                 losses += [float(supervised_loss(mask[several], bodies[several]))] * int(several.sum())
-            if (batch.part >= 0).all():
-                labels = mask.argmax(-1)
-                scores += [rand_index(a, b) for a, b in zip(labels, batch.part)]
+            for labels, part in zip(mask.argmax(-1), batch.part):
+                if (known := part >= 0).any():
+                    scores.append(rand_index(labels[known], part[known]))
         loss = float(np.mean(losses)) if losses else 0.0
         return {"validation_loss": loss, "validation_rand_index": float(np.mean(scores)) if scores else None}
 

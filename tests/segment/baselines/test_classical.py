@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -254,6 +255,18 @@ def test_trajectory_affinity_by_hand() -> None:
     assert affinity[0, 1] == 1  # apart, but alike
     expected = np.exp(-((1 + np.sqrt(2)) / 2 / 0.5) * (1 / 4))
     np.testing.assert_allclose(affinity[0, 2], expected)
+
+
+def test_the_memory_of_an_affinity_does_not_grow_with_the_frames() -> None:
+    peaks = []
+    for frames in (5, 50):
+        tracks = np.random.default_rng(0).standard_normal((200, frames, 3))
+        trajectory_affinity(tracks[:, :2], tracks[:, 1:2])  # imports
+        tracemalloc.start()
+        trajectory_affinity(tracks, tracks[:, 1:])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0]
 
 
 def test_eigengap_and_spectral_parts() -> None:

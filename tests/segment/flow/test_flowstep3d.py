@@ -17,8 +17,8 @@ from dpcli.segment.flow.config import PRESETS, FlowConfig, FlowSchedule
 from dpcli.segment.flow.estimators import estimate_flow
 from dpcli.segment.flow.flowstep3d import FlowStep3D, SetConv
 from dpcli.segment.flow.losses import chamfer, flow_loss
-from dpcli.segment.flow.model_file import augment_pair, load_flow_model, save_flow_model
-from dpcli.segment.flow.trainer import COLUMNS, FlowTrainer
+from dpcli.segment.flow.model_file import load_flow_model, save_flow_model
+from dpcli.segment.flow.trainer import COLUMNS, FlowTrainer, augment_pair
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 TINY = FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbors=6, iterations=3)

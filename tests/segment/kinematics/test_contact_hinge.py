@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from dpcli.ops.rotations import axis_rotation
 from dpcli.segment.kinematics.contact_hinge import contact_hinge
 from dpcli.segment.multibody.explanation import body_of, label_points
-from dpcli.segment.multibody.frames import Frames, compose, relative_motion
+from dpcli.segment.multibody.frames import Frames, relative_motion
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.rigid_motions import compose
 
 WIDTH, DEPTH, HEIGHT, FLAP = 0.5, 0.4, 0.3, 0.25
 EDGE = np.array([0.0, 0.0, HEIGHT])  # the hinge runs along y through it

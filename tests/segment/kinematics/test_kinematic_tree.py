@@ -8,7 +8,7 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.segment.kinematics.joint_fit import fit_joint
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
-from dpcli.segment.kinematics.part_trajectories import moved, part_trajectories, points_at_start
+from dpcli.segment.kinematics.part_trajectories import part_trajectories, points_at_start
 from dpcli.segment.kinematics.registration import (
     Registration,
     motion_twist,
@@ -17,6 +17,7 @@ from dpcli.segment.kinematics.registration import (
     twist_motion,
 )
 from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
+from dpcli.segment.rigid_motions import move
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
 
@@ -194,7 +195,7 @@ def test_motions_of_many_pairs_are_averaged():
             np.sqrt(np.mean([(gap**2).sum(0) for gap in gaps])), rel=0.03
         )  # of 64 points
         assert 0.003 < said_apart
-        assert moved(found.motion[2, k], start[:3].T) == pytest.approx((found.motion[2, k] @ start)[:3].T)
+        assert move(found.motion[2, k], start[:3].T) == pytest.approx((found.motion[2, k] @ start)[:3].T)
         assert points_at_start(sequence, k, found.motion[:, k]) == pytest.approx(start[:3].T, abs=1e-9)
 
 

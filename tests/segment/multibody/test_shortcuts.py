@@ -9,9 +9,10 @@ from dpcli.segment.flow.motion_proposals import ANGLES, SHIFTS, SPINS, propose_m
 from dpcli.segment.flow.rigid_bodies import BodySearch, find_bodies, find_surface_bodies
 from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.multibody.explanation import body_of, label_points
-from dpcli.segment.multibody.frames import POINT_SHARE, Frames, compose, move, relative_motion
+from dpcli.segment.multibody.frames import POINT_SHARE, Frames, relative_motion
 from dpcli.segment.multibody.label_kernels import alike_kernel, mean_field_kernel, row_length, support_kernel
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.rigid_motions import compose, move
 
 
 def some_frames(frames: int = 3, points: int = 60, seed: int = 0) -> Frames:

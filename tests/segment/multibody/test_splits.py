@@ -6,11 +6,12 @@ import numpy as np
 import torch
 
 from dpcli.segment.multibody.explanation import body_of, label_points
-from dpcli.segment.multibody.frames import Frames, Trajectory, move, relative_motion
+from dpcli.segment.multibody.frames import Frames, Trajectory, relative_motion
 from dpcli.segment.multibody.hypotheses import Hypothesis
 from dpcli.segment.multibody.search import Search
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.splits import split_bodies
+from dpcli.segment.rigid_motions import move
 from dpcli.segment.training.trainer import rand_index
 
 STEP = 0.3  # radians that the second link turns by in a frame

@@ -220,6 +220,23 @@ def test_counts_of_the_released_and_the_compact_network(cloud):
     assert count_macs(ours, torch.randn(1, 512, 3) * 0.3)["total"] <= 0.92e9
 
 
+@pytest.mark.parametrize("config", [compact(), release()], ids=["compact", "release"])
+def test_no_more_neighbors_are_counted_than_a_layer_of_few_points_has(config):
+    """By a forward pass, in which every layer but the first sums over the neighbors that it was given."""
+    network, wanted = PartNetwork(config).encoder, []
+    for block in network.blocks:
+        for conv in block:
+            conv.spatial.register_forward_pre_hook(
+                lambda layer, given: wanted.append(0 if given[0] is None else given[1].index.numel() * layer.channels)
+            )
+    with torch.inference_mode():
+        network(torch.rand(1, 32, 3) - 0.5)
+    kernel = kernel_points(config.kernel, config.group)
+    first = config.layers[0][0]
+    constant = 16 * len(kernel.orbit) * (32 if config.rule == "nearest" else first.neighbors)
+    assert convolution_macs(config, 32)["neighbor_sums"] == constant + 60 * len(kernel.points) * sum(wanted)
+
+
 def test_motion_head_finds_a_rotation_of_the_group_in_matching_features():
     """With the right direction, features of the labeled pairs are equal: f2(T R_a) = f1(R_a) (facts 1.7)."""
     group = icosahedral_group()
