@@ -160,6 +160,12 @@ def test_what_does_not_fit_is_refused(two, tmp_path):
         merge([two[0], tmp_path / "text.h5"], tmp_path / "x.h5")
 
 
+def test_a_label_map_knows_the_classes_of_all_files_of_one_name(tmp_path):
+    sources = [(tmp_path / "one" / "train.h5", ["wave"]), (tmp_path / "two" / "train.h5", ["push"])]
+    for labels in (LabelMap(labels={"wave": "hello"}), LabelMap(files={"train.h5": {"wave": "hello"}})):
+        assert labels.resolve(sources) == (["hello", "push"], [[0], [1]])
+
+
 def test_fields_that_not_all_have_are_left_out(tmp_path):
     paths = [
         write(tmp_path / "a.h5", ["a"], [], fields=["time", "track"]),
