@@ -66,8 +66,9 @@ def keep_only_hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.nda
     blurred = cv2.medianBlur(depth, median) if median else depth
     mask = (blurred > 0).astype(np.uint8)
     if close:
-        square = np.ones((close, close), np.uint8)
-        mask = cv2.erode(cv2.dilate(mask, square), square)
+        square, anchor = np.ones((close, close), np.uint8), (close - 1) // 2
+        dilated = cv2.dilate(mask, square)  # about close // 2, so that an even square is the other way round below
+        mask = cv2.erode(dilated, square, anchor=(anchor, anchor))
     return np.where(largest_component(mask) > 0, blurred, 0)
 
 
