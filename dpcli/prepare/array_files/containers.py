@@ -181,7 +181,10 @@ def tables_inside(path: Path) -> list[str]:
     def note(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
             _require_type(item, path)
-        if "pandas_type" in item.attrs if isinstance(item, h5py.Group) else item.dtype.names:
+            is_table = item.dtype.names
+        else:
+            is_table = isinstance(item, h5py.Group) and "pandas_type" in item.attrs
+        if is_table:
             found.append(name)
 
     with reading(path), h5py.File(path, "r") as file:
@@ -320,7 +323,7 @@ def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.n
     if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
         refuse_claim(item, path)
         return _cells(file, item, path) or None
-    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item):
+    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item) or _is_text(item):
         return None
     try:
         refuse_claim(item, path)
@@ -342,6 +345,11 @@ def _require_type(item: h5py.Dataset, path: Path) -> None:
         raise DataError(
             f"{path}: {item.name} is of a type that isn't read ({error}); write it without, such as times as Float64Col"
         ) from None
+
+
+def _is_text(item: h5py.Dataset) -> bool:
+    """Returns whether the numbers of a data set are the letters of one of MATLAB's texts."""
+    return item.attrs.get("MATLAB_class") == b"char"
 
 
 def _is_bare_dimension(item: h5py.Dataset) -> bool:
@@ -406,7 +414,7 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> list[np.ndarray] 
     if item.attrs.get("MATLAB_class") != b"cell":
         return None
     inside = [file[reference] for reference in item[()].reshape(-1)]
-    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" for one in inside):
+    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_text(one) for one in inside):
         return None
     for one in inside:
         refuse_claim(one, path)
