@@ -34,13 +34,15 @@ _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
 class ByName(dict[str, Content]):
-    """Holds something for each array of a file by name, and what was found out about the names: by the pattern that they fit, those
-    of each group. A file may hold thousands of sequences, and its names are searched once, not for each of them.
+    """Holds something for each array of a file by name, and what was found out about them: by the pattern that they fit, the names
+    of each group, and the lists that cells of MATLAB are. A file may hold thousands of sequences, and its names are searched and
+    its cells read once, not for each of them.
     """
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.fitting: dict[re.Pattern[str], dict[str, list[str]]] = {}
+        self.cells: dict[str, list[np.ndarray]] = {}
 
 
 class Reversed:
@@ -282,10 +284,11 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             found = {name: array for name, array in shown.items() if array is not None}
             _names.clear()  # of the file before
             _names[state] = ByName({name: items[name].name for name in found})
+            _names[state].cells = {name: array for name, array in found.items() if isinstance(array, list)}
         else:
             found = {}
         names = _names[state]
-        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found)
+        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found | names.cells)
 
 
 class _Opened(Mapping[str, Any]):

@@ -212,3 +212,23 @@ def test_sequences_of_a_file_of_many_arrays_are_opened_by_name(tmp_path, monkeyp
     )
     sample = reader.read(items[7], np.random.default_rng(0)).sequence
     assert np.allclose(sample.points, (clouds()[:5] + 7).reshape(-1, 3)) and len(set(looked)) == 5
+
+
+def test_a_cell_of_many_sequences_is_read_once(tmp_path, monkeypatch):
+    """Each of its sequences would else read those of all others."""
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        places = []
+        for walk in range(20):
+            file[f"#refs#/{walk}"] = (clouds() + walk).T
+            places.append(file[f"#refs#/{walk}"].ref)
+        file["walks"] = np.array([places], h5py.ref_dtype)
+        file["walks"].attrs["MATLAB_class"] = np.bytes_("cell")
+    looked, read = [], containers._cells
+    monkeypatch.setattr(
+        containers, "_cells", lambda file, item, path: looked.append(item.name) or read(file, item, path)
+    )
+    reader = ArraySequences(tmp_path / "a.mat")
+    for walk, item in enumerate(reader.items()):
+        sample = reader.read(item, np.random.default_rng(0)).sequence
+        assert np.allclose(sample.points, (clouds() + walk).reshape(-1, 3))
+    assert walk == 19 and looked == ["/walks"]
