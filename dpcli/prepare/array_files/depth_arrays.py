@@ -23,6 +23,7 @@ _MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
 _SMALL = 4096  # numbers of an array that may tell of the camera
 _LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
 _WHOLE = 50  # numbers above are no meters
+_MARK = 65535  # what whole numbers have where nothing was seen, see `depth_units.without_marks`
 
 
 def says_depth(name: str) -> bool:
@@ -114,8 +115,12 @@ def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:
     """
     if array.ndim not in (2, 3) or min(array.shape[:2]) < _LEAST and min(array.shape[1:]) < _LEAST:
         raise DataError(f"{path}: array of shape {array.shape}; expected depth (height, width, frames)")
-    if array.dtype.kind == "f" and array.max(initial=0) > _WHOLE and (array == np.floor(array)).all():
-        array = array.astype(np.uint16 if 0 <= array.min() and array.max() < 1 << 16 else np.int32)
+    if array.dtype.kind == "f":
+        finite = np.isfinite(array)
+        told = array[finite]
+        if told.max(initial=0) > _WHOLE and (told == np.floor(told)).all():
+            kind = np.uint16 if told.min() >= 0 and told.max() <= _MARK else np.int32
+            array = np.where(finite, array, _MARK).astype(kind)
     if array.ndim == 2:
         return array
     behind, before = array.shape[:2] in _SIZES, array.shape[1:] in _SIZES

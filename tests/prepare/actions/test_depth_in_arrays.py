@@ -77,6 +77,15 @@ def test_the_unit_of_depth_in_whole_numbers_counts(tmp_path, unit, scale):
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
 
 
+def test_doubles_of_matlab_that_mark_what_is_unseen_are_millimeters_too(tmp_path):
+    depth = DEPTH.astype(float)
+    depth[0, 0, :3] = np.nan, np.inf, -np.inf
+    reader = DepthVideos(inputs=(write(tmp_path / "a.mat", {"depth": depth.transpose(0, 2, 1)}),))
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    assert np.allclose(sample.sequence.points[:, 2], DEPTH.ravel()[3:] / 1000)
+    assert sample.notes["pixels without a depth (NaN, 65535 and the like) dropped"] == 3
+
+
 def test_depth_in_meters_needs_no_scale_of_attributes(tmp_path):
     found, _ = read(write(tmp_path / "a.h5", {"depth": np.float32(DEPTH / 1000)}, units="m", depth_scale=1000.0))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 1000)
