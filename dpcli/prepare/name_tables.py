@@ -29,7 +29,7 @@ _PERHAPS = {  # where no column is called as above; the first two only together
     "split": "set partition",
 }
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
-_DIVIDER_TOLD = re.compile(r"\s*\"?sep=.\"?\s*\n")  # a first line for spreadsheets
+_DIVIDER_TOLD = re.compile(r"\s*\"?sep=(.)\"?\s*\n")  # a first line for spreadsheets
 _NOTHING = {"nan", "null", "n/a", "#n/a"}  # as programs write a cell without a value
 
 
@@ -78,7 +78,7 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
         if told := _DIVIDER_TOLD.match(text):
             text = "\n" + text[told.end() :]  # lines keep their numbers
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
-        divider = next((mark for mark in ",;\t" if mark in first), ",")
+        divider = told[1] if told else next((mark for mark in ",;\t" if mark in first), ",")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
     except DataError as error:
         raise DataError(

@@ -128,6 +128,8 @@ def test_a_line_that_tells_spreadsheets_the_divider_is_none_of_the_table(tmp_pat
     (tmp_path / "labels.csv").write_text(line + "name;label\na;wave\nb;\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"labels\.csv:4: 'b,'"):
         read_labels(tmp_path / "labels.csv")
+    (tmp_path / "labels.csv").write_text(line + "a, left;wave\nb;bow\n", encoding="utf-8")
+    assert list(read_labels(tmp_path / "labels.csv").rows) == ["a, left", "b"]  # without a header, and with a comma
 
 
 @pytest.mark.parametrize(
