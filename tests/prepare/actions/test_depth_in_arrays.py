@@ -53,7 +53,17 @@ def test_times_beside_depth_are_those_of_its_frames(tmp_path, form, name, values
     assert np.allclose(read(path, fps=5)[0].time, 2 * SECONDS)
 
 
-@pytest.mark.parametrize("values", [np.zeros(FRAMES), np.arange(FRAMES - 1) * 0.1, np.arange(FRAMES), SECONDS[::-1]])
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.zeros(FRAMES),
+        np.arange(FRAMES - 1) * 0.1,
+        np.arange(FRAMES),
+        SECONDS[::-1],
+        np.where(SECONDS == 0, np.nan, SECONDS),
+        np.where(SECONDS == 0, -np.inf, SECONDS),
+    ],
+)
 def test_times_that_do_not_fit_are_named(tmp_path, values):
     sequence, notes = read(write(tmp_path / "a.h5", {"depth": DEPTH, "time": values}))
     assert sequence.time is None and "arrays that are not read (time)" in notes
