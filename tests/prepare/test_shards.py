@@ -16,7 +16,8 @@ from dpcli.runtime.machines.shards import Shard, describe_shard, shard_of
 from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions
-from tests.support.prepare_helpers import ToyReader, dpc
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ToyReader
 
 SYNTHETIC = (
     "prepare",

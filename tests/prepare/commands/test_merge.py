@@ -21,7 +21,8 @@ from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from tests.support.prepare_helpers import ROOT, ToyReader, dpc
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ROOT, ToyReader
 
 
 def write(path: Path, names: list[str], classes: list[str], **options) -> Path:
@@ -179,7 +180,7 @@ def test_fields_that_not_all_have_are_left_out(tmp_path):
 
 def test_the_command(two, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps({"labels": {"g1": "push"}}))
-    done = dpc("prepare", "merge", *two, "-o", tmp_path / "all.h5", "--labels", tmp_path / "map.json", "-q")
+    done = dpc("prepare", "merge", *two, "-o", tmp_path / "all.h5", "--labels", tmp_path / "map.json")
     assert (
         done.returncode == 0 and done.stdout == f"{tmp_path / 'all.h5'}: 5 sequences, 5 frames, 14 points, 2 skipped\n"
     )
