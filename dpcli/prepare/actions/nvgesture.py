@@ -19,6 +19,8 @@ from dpcli.store import CloudSequence
 from dpcli.text_files import read_text
 
 CLASSES = 25
+CLASS_NAMES = tuple(f"gesture {number:02}" for number in range(1, CLASSES + 1))
+IMAGE_UNIT = "pixel (row, column), gray level (depth; nearer = larger)"
 _SIZE, _FPS = (240, 320), 30.0  # rows and columns of the pictures, frames a second
 INTRINSICS = Intrinsics(224.502, 230.494, 160.0, 120.0)
 _CAMERA = Calibration(INTRINSICS, *_SIZE[::-1], source="the camera of NvGesture")
@@ -111,14 +113,12 @@ class NvGesture:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return [f"gesture {number:02}" for number in range(1, CLASSES + 1)]
+        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        if self.coordinates == "image":
-            return "pixel (row, column), gray level (depth; nearer = larger)"
-        return "255 - gray level"
+        return IMAGE_UNIT if self.coordinates == "image" else "255 - gray level"
 
     @property
     def config(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.actions.shrec17_lists import PUBLISHED, find_lists, gesture_names, listed_items
+from dpcli.prepare.actions.shrec17_lists import IMAGE_UNIT, PUBLISHED, find_lists, gesture_names, listed_items
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -104,7 +104,7 @@ class Shrec17:
     @property
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        return "pixel (row, column), mm (depth)" if self.coordinates == "image" else "mm"
+        return IMAGE_UNIT if self.coordinates == "image" else "mm"
 
     @property
     def config(self) -> dict[str, Any]:
