@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import unicodedata
 from collections import Counter
@@ -79,7 +80,8 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
             text = "\n" + text[told.end() :]  # lines keep their numbers
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
         divider = told[1] if told else next((mark for mark in ",;\t" if mark in first), ",")
-        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
+        rows = csv.reader(io.StringIO(text), delimiter=divider)  # `splitlines` would end lines at other signs, too
+        lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except DataError as error:
         raise DataError(
             str(error).replace("expected numbers in columns", f"expected a CSV table of name,{needed}")
@@ -92,7 +94,7 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
         ) from None
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
-    numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
+    numbered = [(number, row) for number, row in lines if any(row)]
     while numbered and numbered[0][1][0].startswith("#"):
         numbered.pop(0)
     return numbered
