@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_DIRECTIONS = 512
+
 
 def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, float]:
     """Returns center f64 (3) and radius of a small ball that holds all points (...,3).
@@ -20,13 +22,13 @@ def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, f
     return center, float(np.sqrt(((points - center) ** 2).sum(1).max()))
 
 
-def _extreme(points: np.ndarray, directions: int = 512) -> np.ndarray:
+def _extreme(points: np.ndarray) -> np.ndarray:
     """Returns the points that can touch a bounding ball, nearly: the farthest in each of many directions; millions are
     slow.
     """
     if len(points) < 2_000:
         return points
-    k = np.arange(directions) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * k / directions), np.pi * (1 + 5**0.5) * k  # a Fibonacci lattice on the sphere
+    k = np.arange(_DIRECTIONS) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + 5**0.5) * k  # a Fibonacci lattice on the sphere
     lattice = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
     return points[np.unique([(points @ direction).argmax() for direction in lattice.T.astype(points.dtype)])]

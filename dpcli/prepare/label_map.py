@@ -87,7 +87,9 @@ class LabelMap:
         return own.get(name, self.labels.get(name, name))
 
     def _refuse_unknown(self, sources: Sequence[tuple[Path, list[str]]]) -> None:
-        known = {path.name: names for path, names in sources}
+        known: dict[str, list[str]] = {}
+        for path, names in sources:  # several files may have one name
+            known.setdefault(path.name, []).extend(names)
         for file, table in self.files.items():
             if file not in known:
                 raise DataError(f"label map: no file {file!r} among {', '.join(known)}")

@@ -134,14 +134,16 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:
     for record in records.values():
         record["label"] = _WHOLE.sub(r"\1", record["label"])
-    words = [record["label"] for record in records.values()]
-    if all(_is_number(word) for word in words):
+    words = {record["label"] for record in records.values()}
+    labels = {0}
+    if all(map(_is_number, words)):
         class_names = [str(k) for k in range(_plausible(path, records) + 1)]
-    elif any(_is_number(word) for word in words):
+        labels = {int(word) for word in words}
+    elif any(map(_is_number, words)):
         raise DataError(f"{path}: some labels are numbers and some are words; use one kind")
     else:
-        class_names = sorted(set(words))
-    _warn_of_classes(path, class_names, {int(word) for word in words} if all(map(_is_number, words)) else {0})
+        class_names = sorted(words)
+    _warn_of_classes(path, class_names, labels)
     places = {name: place for place, name in enumerate(class_names)}
     rows, people = {}, _people(record.get("subject", "") for record in records.values())
     for name, record in records.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import unicodedata
 from collections import Counter
@@ -29,7 +30,7 @@ _PERHAPS = {  # where no column is called as above; the first two only together
     "split": "set partition",
 }
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
-_DIVIDER_TOLD = re.compile(r"\s*\"?sep=.\"?\s*\n")  # a first line for spreadsheets
+_DIVIDER_TOLD = re.compile(r"\s*\"?sep=(.)\"?\s*\n")  # a first line for spreadsheets
 _NOTHING = {"nan", "null", "n/a", "#n/a"}  # as programs write a cell without a value
 
 
@@ -78,8 +79,9 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
         if told := _DIVIDER_TOLD.match(text):
             text = "\n" + text[told.end() :]  # lines keep their numbers
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
-        divider = next((mark for mark in ",;\t" if mark in first), ",")
-        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
+        divider = told[1] if told else next((mark for mark in ",;\t" if mark in first), ",")
+        rows = csv.reader(io.StringIO(text), delimiter=divider)  # `splitlines` would end lines at other signs, too
+        lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except DataError as error:
         raise DataError(
             str(error).replace("expected numbers in columns", f"expected a CSV table of name,{needed}")
@@ -92,7 +94,7 @@ def _read_lines(path: Path, needed: str) -> list[tuple[int, list[str]]]:
         ) from None
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
-    numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
+    numbered = [(number, row) for number, row in lines if any(row)]
     while numbered and numbered[0][1][0].startswith("#"):
         numbered.pop(0)
     return numbered

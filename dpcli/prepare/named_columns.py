@@ -73,7 +73,8 @@ class ArrayTable:
             return np.where(known, (since - first) / np.timedelta64(1, "s"), np.nan)
         told = self._units.get(name, "").split()[:1]
         unit = seconds_of(f"t [{told[0]}]", column[:1]) if told and column.dtype.kind in "uif" and len(column) else 0.0
-        return (column - column[0].astype(column.dtype)).astype(np.float64) * unit if unit else None
+        column = column.astype(np.int64) if column.dtype.kind in "ui" else column  # whose differences don't wrap around
+        return (column - column[0]).astype(np.float64) * unit if unit else None
 
 
 def holds_table(path: Path) -> bool:

@@ -129,10 +129,7 @@ def _fingerprint(path: Path) -> str:
         names = sorted(name for name in os.listdir(path) if not _may_be_ours(name))
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
-    except (
-        OSError,
-        ValueError,
-    ):  # an item that is made, or of a file beside others, or not there, or whose name holds NUL
+    except (OSError, ValueError):  # it is made, or of a file beside others, or not there, or its name holds NUL
         return ""
 
 

@@ -341,18 +341,15 @@ def choose_series(
     found = _mixed_formats(folder, all_series(folder, frames))
     left_out: list[Series] = []
     rules = (
-        _numbered,
+        lambda s: _only(s, lambda one: one.numbered),
         lambda s: _preferred(s, suffixes, judge),
-        _no_texts,
-        lambda s: _wanted(s, wanted),
-        _more_than_one,
+        lambda s: _only(s, lambda one: one.suffix not in TEXTS),
+        lambda s: _only(s, lambda one: re.search(wanted, one.pattern, re.IGNORECASE) is not None),
+        lambda s: _only(s, lambda one: len(one.names) > 1),
+        lambda s: _only(s, lambda one: judge(one.paths[0])) if judge and len(s) > 1 else s,
     )
     for rule in rules:
         kept = rule(found)
-        left_out += _without(found, kept)
-        found = kept
-    if len(found) > 1 and judge is not None:
-        kept = [one for one in found if judge(one.paths[0])] or found
         left_out += _without(found, kept)
         found = kept
     if len(found) > 1:
@@ -416,8 +413,9 @@ def _made_of(folder: Path, same: list[Series]) -> Series:
     return replace(one, pattern=one.pattern[: -len(one.suffix)] + ".*" if one.suffix else one.pattern)
 
 
-def _numbered(found: list[Series]) -> list[Series]:
-    return [one for one in found if one.numbered] or found
+def _only(found: list[Series], fits: Callable[[Series], bool]) -> list[Series]:
+    """Returns the series that fit, all where none does."""
+    return [one for one in found if fits(one)] or found
 
 
 def _preferred(
@@ -456,17 +454,3 @@ def _is_twin(one: Series, formats: dict[str, set[str]]) -> bool:
 def _without(found: list[Series], others: Sequence[Series]) -> list[Series]:
     gone = set(others)  # a folder may hold thousands of series
     return [one for one in found if one not in gone]
-
-
-def _no_texts(found: list[Series]) -> list[Series]:
-    return [one for one in found if one.suffix not in TEXTS] or found
-
-
-def _wanted(found: list[Series], wanted: str) -> list[Series]:
-    if not wanted:
-        return found
-    return [one for one in found if re.search(wanted, one.pattern, re.IGNORECASE)] or found
-
-
-def _more_than_one(found: list[Series]) -> list[Series]:
-    return [one for one in found if len(one.names) > 1] or found

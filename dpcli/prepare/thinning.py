@@ -70,6 +70,7 @@ class Thinning:
         chosen = []
         tracks = None if sequence.track is None else np.unique(sequence.track, return_inverse=True)[1].reshape(-1)
         rank = np.full(0 if tracks is None else tracks.max() + 1, -1)  # of a track: how many were chosen before it
+        known = 0
         for start, count in zip(sequence.frame_offsets[:-1], counts, strict=True):
             frame = sequence.points[start : start + count]
             if tracks is None:
@@ -78,7 +79,8 @@ class Thinning:
                 own = tracks[start : start + count]
                 index = self._choose_again(frame, rank[own], rng)
                 fresh = own[index][rank[own[index]] < 0]
-                rank[fresh] = rank.max() + 1 + np.arange(len(fresh))
+                rank[fresh] = known + np.arange(len(fresh))
+                known += len(fresh)
             chosen.append(index + start)
         sequence.take_points(np.concatenate(chosen), offsets(np.array([len(c) for c in chosen], np.int64)))
         return sequence

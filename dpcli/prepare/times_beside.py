@@ -53,6 +53,8 @@ def seconds_beside(name: str, values: np.ndarray, units: str = "") -> np.ndarray
         since = (values - values[:1]) / np.timedelta64(1, "s")
     else:
         values, name = values.astype(np.float64), f"time {name.rpartition('/')[2]}"  # whatever else it is called
+        if not np.isfinite(values).all():
+            return None
         unit = re.match(r"[^\W\d]+", units)
         since = values - values[:1]
         since *= seconds_of(f"{name} [{unit[0]}]" if unit else name, values) if len(values) else 1

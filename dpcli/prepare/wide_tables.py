@@ -114,7 +114,7 @@ def hint(path: Path, error: DataError) -> DataError:
 
 
 def _checked(path: Path, table: TextTable | ParquetTable | ArrayTable, told: list[list[str]], unit: str) -> WideTable:
-    trios = _trios([[name] for name in table.names] if not isinstance(table, TextTable) else told)
+    trios = _trios(told)
     if len(trios) < 2:
         raise DataError(f"{path}: --track columns: {len(trios)} points in the columns; expected two or more")
     if isinstance(table, TextTable) and not table.first_rows(1):

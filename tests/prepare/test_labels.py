@@ -123,11 +123,22 @@ def test_classes_that_look_alike_are_told(tmp_path, capsys, one, other, told):
     assert ("are different classes" in capsys.readouterr().err) == told
 
 
+def test_lines_end_where_spreadsheets_end_them(tmp_path):
+    """Three dots of Windows, which are a line's end in another encoding, and a cell of two lines."""
+    (tmp_path / "labels.csv").write_bytes(b'name,label\na,wave\x85\nb,bow\x85low\n"c\nd",bow\ne,\n')
+    with pytest.raises(DataError, match=r"labels\.csv:6: 'e,'"):
+        read_labels(tmp_path / "labels.csv")
+    (tmp_path / "labels.csv").write_bytes(b"name,label\na,wave\x85\nb,bow\x85low\n")
+    assert read_labels(tmp_path / "labels.csv").class_names == ["bow\x85low", "wave"]
+
+
 @pytest.mark.parametrize("line", ["sep=;\n", '"sep=;"\r\n', "\ufeffsep=;\n"])
 def test_a_line_that_tells_spreadsheets_the_divider_is_none_of_the_table(tmp_path, line):
     (tmp_path / "labels.csv").write_text(line + "name;label\na;wave\nb;\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"labels\.csv:4: 'b,'"):
         read_labels(tmp_path / "labels.csv")
+    (tmp_path / "labels.csv").write_text(line + "a, left;wave\nb;bow\n", encoding="utf-8")
+    assert list(read_labels(tmp_path / "labels.csv").rows) == ["a, left", "b"]  # without a header, and with a comma
 
 
 @pytest.mark.parametrize(

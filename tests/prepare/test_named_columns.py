@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.scans.tables import TableSequences
 from dpcli.store import CloudsReader
 from tests.support.commands import told
@@ -123,6 +124,26 @@ def test_units_of_columns_count(tmp_path):
     reader = TableSequences(tmp_path / "a.h5")
     sample = reader.read(reader.items()[0], np.random.default_rng(0)).sequence
     assert np.allclose(sample.points[:, 1], COLUMNS["y"] / 1000) and np.allclose(sample.time, np.arange(FRAMES) * 0.1)
+
+
+@pytest.mark.parametrize("kind", ["u2", "i2", "u4", "u8"])
+def test_whole_times_may_fall_from_row_to_row(tmp_path, kind):
+    """A difference below 0 has no place among unsigned numbers, one above half of their range none among small ones."""
+    stamps = np.array([30_000, 0, 65_000 if kind[0] == "u" else -30_000]).astype(kind)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("frame", *"xyz"):
+            file[name] = np.arange(3.0)
+        file["t"] = stamps
+        file["t"].attrs["units"] = "ms"
+    table = ArrayTable(tmp_path / "a.h5")
+    assert np.allclose(table.moments(table.names.index("t")), (stamps.astype(float) - 30_000) / 1000)
+
+
+def test_a_type_that_has_a_name_is_no_table(tmp_path):
+    """As netCDF keeps the compound types of its variables."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["kind"], file["log"] = structured().dtype, structured()
+    assert ArrayTable(tmp_path / "a.h5").names == tuple(COLUMNS)
 
 
 def test_rows_that_are_frames_are_read_where_that_is_asked_for(tmp_path):

@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from dpcli.prepare.actions import msraction3d, nvgesture
-from tests.support.prepare_helpers import ROOT, dpc
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ROOT
 
 if sys.version_info >= (3, 11):
     import tomllib

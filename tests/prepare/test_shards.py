@@ -16,7 +16,8 @@ from dpcli.runtime.machines.shards import Shard, describe_shard, shard_of
 from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions
-from tests.support.prepare_helpers import ToyReader, dpc
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ToyReader
 
 SYNTHETIC = (
     "prepare",
@@ -103,6 +104,10 @@ def test_the_command_of_a_shard_is_that_of_the_whole():
 def test_shards_that_do_not_belong_together_are_refused(tmp_path):
     reader = ToyReader(count=7)
     a, b, c = cut(reader, tmp_path, 3)
+    (tmp_path / "copy.h5").write_bytes(b.read_bytes())
+    convert(reader, tmp_path / "seed.h5", Conversion(shard=Shard(2, 3), points=20, seed=1))
+    convert(reader, tmp_path / "four.h5", Conversion(shard=Shard(2, 4), points=20))
+    convert(ToyReader(count=8), tmp_path / "longer.h5", Conversion(shard=Shard(2, 3), points=20))
     for paths, message in (
         ([a, c], "--shard 1/3: missing; make it first"),
         ([a, b, b], "named twice"),
@@ -111,10 +116,6 @@ def test_shards_that_do_not_belong_together_are_refused(tmp_path):
         ([a, b, tmp_path / "four.h5"], "another run than .*0/3 and 2/4"),
         ([a, b, tmp_path / "longer.h5"], "items 7, now 8"),
     ):
-        (tmp_path / "copy.h5").write_bytes(b.read_bytes())
-        convert(reader, tmp_path / "seed.h5", Conversion(shard=Shard(2, 3), points=20, seed=1, force=True))
-        convert(reader, tmp_path / "four.h5", Conversion(shard=Shard(2, 4), points=20, force=True))
-        convert(ToyReader(count=8), tmp_path / "longer.h5", Conversion(shard=Shard(2, 3), points=20, force=True))
         with pytest.raises(UsageError, match=message):
             merge(paths, tmp_path / "all.h5")
     assert not (tmp_path / "all.h5").exists()

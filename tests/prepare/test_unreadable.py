@@ -31,7 +31,8 @@ from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.prepare.thinning import Thinning
 from dpcli.regular_files import regular_files_only
 from tests.support.commands import exit_code
-from tests.support.prepare_helpers import ToyReader, dpc, write_video
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ToyReader, write_video
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,6 @@ ODD = {
 
 @pytest.mark.parametrize("kind", ODD)
 def test_a_frame_that_is_no_file_is_named_by_every_command_of_clips(kind, tmp_path, capsys):
-    from tests.support.commands import exit_code
     from tests.support.video_clips import clip, write_folder
 
     whole, odd = (write_folder(tmp_path / name, clip(views=1)[0], "{:03d}.png") for name in ("whole", "odd"))

@@ -13,14 +13,17 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, pixel_rays
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, published_found, require_folder
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_text
 
 CLASSES = 25
-INTRINSICS = Intrinsics(224.502, 230.494, 160.0, 120.0)
+CLASS_NAMES = tuple(f"gesture {number:02}" for number in range(1, CLASSES + 1))
+IMAGE_UNIT = "pixel (row, column), gray level (depth; nearer = larger)"
 _SIZE, _FPS = (240, 320), 30.0  # rows and columns of the pictures, frames a second
+INTRINSICS = Intrinsics(224.502, 230.494, 160.0, 120.0)
+_CAMERA = Calibration(INTRINSICS, *_SIZE[::-1], source="the camera of NvGesture")
 _SMALLEST = 100  # rows of pictures that may be those of the data set, resized
 _RESIZED = "clips whose video is resized, not 320x240; points are in its own pixels"
 _OTHER_RATE = "clips whose video isn't at 30 frames a second, in which the lists count; are they the right frames?"
@@ -110,14 +113,12 @@ class NvGesture:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return [f"gesture {number:02}" for number in range(1, CLASSES + 1)]
+        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        if self.coordinates == "image":
-            return "pixel (row, column), gray level (depth; nearer = larger)"
-        return "255 - gray level"
+        return IMAGE_UNIT if self.coordinates == "image" else "255 - gray level"
 
     @property
     def config(self) -> dict[str, Any]:
@@ -185,7 +186,7 @@ class NvGesture:
         clouds = [self._points(frame) for frame in frames]
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         kept, notes = drop_empty_frames(str(item.path), counts)
-        if frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
+        if self.coordinates == "image" and frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
             notes[_RESIZED] = 1
         if rate and abs(rate - _FPS) > 1:
             notes[_OTHER_RATE] = 1
@@ -205,7 +206,8 @@ class NvGesture:
         depth = frame.reshape(-1).take(pixels).astype(np.float32)
         if self.coordinates == "camera":
             z = 255 - depth  # a gray level of 255 would be the camera itself
-            return (pixel_rays(*frame.shape, INTRINSICS)[pixels] * z[:, None])[z > 0]
+            camera = _CAMERA.of_pictures(*frame.shape[::-1])
+            return (pixel_rays(*frame.shape, camera)[pixels] * z[:, None])[z > 0]
         points = pixel_places(*frame.shape).take(pixels, axis=0)
         points[:, 2] = depth
         return points

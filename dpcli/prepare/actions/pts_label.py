@@ -14,7 +14,17 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
-from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
+from dpcli.prepare.actions import nvgesture
+from dpcli.prepare.actions.shrec17_lists import (
+    FINGERS,
+    GESTURES,
+    IMAGE_UNIT,
+    Entry,
+    ListFile,
+    entries,
+    find_lists,
+    gesture_names,
+)
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
 from dpcli.store import CloudSequence
@@ -59,7 +69,7 @@ class PtsLabel:
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
         if self._is_nvgesture():
-            return [f"gesture {number:02}" for number in range(1, 26)]
+            return list(nvgesture.CLASS_NAMES)
         found = self._list_files()
         if found:
             return gesture_names(found, self.labels)
@@ -68,16 +78,14 @@ class PtsLabel:
     @property
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        if self._is_nvgesture():
-            return "pixel (row, column), gray level (depth; nearer = larger)"
-        return "pixel (row, column), mm (depth)"
+        return nvgesture.IMAGE_UNIT if self._is_nvgesture() else IMAGE_UNIT
 
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
         return {"labels": self.labels}
 
-    def _list_files(self) -> list:
+    def _list_files(self) -> list[ListFile]:
         if self.lists is not None:
             return find_lists(self.lists)
         try:
@@ -109,8 +117,8 @@ class PtsLabel:
             items[item.name] = item
         return sorted(items.values(), key=lambda item: natural_key(item.name))
 
-    def _absent(self, lists: list, items: dict[str, Item]) -> Iterator[Item]:
-        """Returns items for what the lists name and the folder lacks, and for lines that can't be understood."""
+    def _absent(self, lists: list[ListFile], items: dict[str, Item]) -> Iterator[Item]:
+        """Yields items for what the lists name and the folder lacks, and for lines that can't be understood."""
         for split, where, entry in entries(lists):
             if isinstance(entry, str):
                 yield Item(where, self.raw, split, problem=entry)
@@ -124,7 +132,8 @@ class PtsLabel:
             return Item(relative, path, problem=f"{path}: a link that leads out of the data, to {target}")
         if match := _NVGESTURE.fullmatch(relative):
             label, subject = int(match[2]) - 1, int(match[3])
-            problem = "" if 0 <= label < 25 else f"{path}: class {label + 1} is out of range; expected 1 to 25"
+            known = 0 <= label < nvgesture.CLASSES
+            problem = "" if known else f"{path}: class {label + 1} is out of range; expected 1 to {nvgesture.CLASSES}"
             if not alone:
                 problem = f"{path}: of NvGesture, among SHREC'17, whose classes are others; convert it by itself"
             return Item(match[1], path, label=label, subject=subject, problem=problem)

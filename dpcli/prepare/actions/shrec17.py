@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.actions.shrec17_lists import PUBLISHED, find_lists, gesture_names, listed_items
+from dpcli.prepare.actions.shrec17_lists import IMAGE_UNIT, PUBLISHED, find_lists, gesture_names, listed_items
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -66,8 +66,9 @@ def keep_only_hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.nda
     blurred = cv2.medianBlur(depth, median) if median else depth
     mask = (blurred > 0).astype(np.uint8)
     if close:
-        square = np.ones((close, close), np.uint8)
-        mask = cv2.erode(cv2.dilate(mask, square), square)
+        square, anchor = np.ones((close, close), np.uint8), (close - 1) // 2
+        dilated = cv2.dilate(mask, square)  # about close // 2, so that an even square is the other way round below
+        mask = cv2.erode(dilated, square, anchor=(anchor, anchor))
     return np.where(largest_component(mask) > 0, blurred, 0)
 
 
@@ -103,7 +104,7 @@ class Shrec17:
     @property
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        return "pixel (row, column), mm (depth)" if self.coordinates == "image" else "mm"
+        return IMAGE_UNIT if self.coordinates == "image" else "mm"
 
     @property
     def config(self) -> dict[str, Any]:

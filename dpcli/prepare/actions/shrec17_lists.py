@@ -26,6 +26,7 @@ GESTURES = (
     "shake",
 )
 FINGERS = ("one finger", "whole hand")
+IMAGE_UNIT = "pixel (row, column), mm (depth)"
 PUBLISHED = {"train": 1960, "test": 840}
 _COLUMNS = {"gesture": 14, "finger": 2, "subject": 28, "trial": 0, "label14": 14, "label28": 28, "frames": 0}
 

@@ -21,7 +21,7 @@ _PAIRS = 4096
 _SMOOTHER = 0.5  # steps along one axis as a share of those along another
 _NEAR, _FAR = 0.1, 0.3  # steps as a share of the size: those of motion are below, those to what is no neighbor above
 _FEWER = 2  # times fewer frames than points, from which on the shape tells
-_MATRICES = ((3, 3), (3, 4), (4, 4))
+MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
 
 
 def check_axes(asked: str) -> str:
@@ -61,7 +61,7 @@ def coordinates_axis(shape: tuple[int, ...]) -> int | None:
 
 def are_poses(array: Any) -> bool:
     """Returns whether each of some 3x3, 3x4 or 4x4 numbers turns: poses of a camera, no clouds."""
-    if array.ndim != 3 or tuple(array.shape[1:]) not in _MATRICES:
+    if array.ndim != 3 or tuple(array.shape[1:]) not in MATRICES:
         return False
     first = np.asarray(array[:_LOOKED_AT])[:, :3, :3].astype(np.float64)
     return bool(np.allclose(first @ first.transpose(0, 2, 1), np.eye(3), atol=1e-3))

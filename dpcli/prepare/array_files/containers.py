@@ -34,13 +34,15 @@ _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
 class ByName(dict[str, Content]):
-    """Holds something for each array of a file by name, and what was found out about the names: by the pattern that they fit, those
-    of each group. A file may hold thousands of sequences, and its names are searched once, not for each of them.
+    """Holds something for each array of a file by name, and what was found out about them: by the pattern that they fit, the names
+    of each group, and the lists that cells of MATLAB are. A file may hold thousands of sequences, and its names are searched and
+    its cells read once, not for each of them.
     """
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.fitting: dict[re.Pattern[str], dict[str, list[str]]] = {}
+        self.cells: dict[str, list[np.ndarray]] = {}
 
 
 class Reversed:
@@ -181,7 +183,10 @@ def tables_inside(path: Path) -> list[str]:
     def note(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
             _require_type(item, path)
-        if "pandas_type" in item.attrs if isinstance(item, h5py.Group) else item.dtype.names:
+            is_table = item.dtype.names
+        else:
+            is_table = isinstance(item, h5py.Group) and "pandas_type" in item.attrs
+        if is_table:
             found.append(name)
 
     with reading(path), h5py.File(path, "r") as file:
@@ -279,10 +284,11 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             found = {name: array for name, array in shown.items() if array is not None}
             _names.clear()  # of the file before
             _names[state] = ByName({name: items[name].name for name in found})
+            _names[state].cells = {name: array for name, array in found.items() if isinstance(array, list)}
         else:
             found = {}
         names = _names[state]
-        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found)
+        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found | names.cells)
 
 
 class _Opened(Mapping[str, Any]):
@@ -320,7 +326,7 @@ def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.n
     if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
         refuse_claim(item, path)
         return _cells(file, item, path) or None
-    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item):
+    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item) or _is_text(item):
         return None
     try:
         refuse_claim(item, path)
@@ -342,6 +348,11 @@ def _require_type(item: h5py.Dataset, path: Path) -> None:
         raise DataError(
             f"{path}: {item.name} is of a type that isn't read ({error}); write it without, such as times as Float64Col"
         ) from None
+
+
+def _is_text(item: h5py.Dataset) -> bool:
+    """Returns whether the numbers of a data set are the letters of one of MATLAB's texts."""
+    return item.attrs.get("MATLAB_class") == b"char"
 
 
 def _is_bare_dimension(item: h5py.Dataset) -> bool:
@@ -406,7 +417,7 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> list[np.ndarray] 
     if item.attrs.get("MATLAB_class") != b"cell":
         return None
     inside = [file[reference] for reference in item[()].reshape(-1)]
-    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" for one in inside):
+    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_text(one) for one in inside):
         return None
     for one in inside:
         refuse_claim(one, path)

@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.axes import MATRICES, are_poses
 from dpcli.prepare.array_files.containers import PACKING, Unreadable, attributes_of, open_arrays, told_units
 
 # names that say depth, and not a picture of it or what lies beside it
@@ -19,10 +20,10 @@ _SIZES = (  # (height, width) of depth cameras
     *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
     *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
 )
-_MATRICES = ((3, 3), (3, 4), (4, 4))  # shapes of a camera's
 _SMALL = 4096  # numbers of an array that may tell of the camera
 _LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
 _WHOLE = 50  # numbers above are no meters
+_MARK = 65535  # what whole numbers have where nothing was seen, see `depth_units.without_marks`
 
 
 def says_depth(name: str) -> bool:
@@ -47,7 +48,7 @@ def depth_frames(path: Path, array: np.ndarray, stride: int = 1) -> np.ndarray:
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
         )
     _require_frames_first(path, array.shape)
-    if array.shape[1:] in _MATRICES and _are_matrices(array):
+    if are_poses(array) or array.shape[1:] in MATRICES and _project(array):
         raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
     return np.ascontiguousarray(array[::stride])
 
@@ -81,7 +82,7 @@ def archived_depth(path: Path) -> ArchivedDepth:
     with open_arrays(path) as opened:
         arrays = {name: one for name, one in opened.items() if not isinstance(one, list)}
         shaped = [k for k, v in arrays.items() if v.ndim in (2, 3) and 1 not in v.shape[:2] and v.dtype.kind in "uif"]
-        called = [k for k, v in arrays.items() if says_depth(k) and v.ndim > 1 and v.shape not in _MATRICES]
+        called = [k for k, v in arrays.items() if says_depth(k) and v.ndim > 1 and v.shape not in MATRICES]
         plainly = [k for k in called if k in shaped and "depth" in k.lower()]  # d_depth beside d_color and d_time
         chosen = next((choice[0] for choice in (called, plainly, shaped) if len(choice) == 1), None)
         if chosen is None:
@@ -114,8 +115,12 @@ def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:
     """
     if array.ndim not in (2, 3) or min(array.shape[:2]) < _LEAST and min(array.shape[1:]) < _LEAST:
         raise DataError(f"{path}: array of shape {array.shape}; expected depth (height, width, frames)")
-    if array.dtype.kind == "f" and array.max(initial=0) > _WHOLE and (array == np.floor(array)).all():
-        array = array.astype(np.uint16 if 0 <= array.min() and array.max() < 1 << 16 else np.int32)
+    if array.dtype.kind == "f":
+        finite = np.isfinite(array)
+        told = array[finite]
+        if told.max(initial=0) > _WHOLE and (told == np.floor(told)).all():
+            kind = np.uint16 if told.min() >= 0 and told.max() <= _MARK else np.int32
+            array = np.where(finite, array, _MARK).astype(kind)
     if array.ndim == 2:
         return array
     behind, before = array.shape[:2] in _SIZES, array.shape[1:] in _SIZES
@@ -132,9 +137,6 @@ def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array.transpose(2, 0, 1)) if behind else array
 
 
-def _are_matrices(array: np.ndarray) -> bool:
-    """Returns whether each of some 3x3, 3x4 or 4x4 numbers turns, or projects as a pinhole camera does."""
-    first = array[:, :3, :3].astype(np.float64)
-    turns = np.allclose(first @ first.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-    projects = (first[:, 2] == (0, 0, 1)).all() and not first[:, (0, 1), (1, 0)].any()
-    return bool(turns or projects)
+def _project(matrices: np.ndarray) -> bool:
+    """Returns whether each of some 3x3, 3x4 or 4x4 numbers projects as a pinhole camera does."""
+    return bool((matrices[:, 2, :3] == (0, 0, 1)).all() and not matrices[:, (0, 1), (1, 0)].any())

@@ -25,7 +25,8 @@ _COMPLEX = 8  # flag
 _BEGIN = 4096  # bytes of a compressed array in which its name and shape are
 _MOST = 1 << 31  # bytes of one array
 
-Element = tuple[int, bytes]  # type, content
+Bytes = bytes | memoryview
+Element = tuple[int, Bytes]  # type, content
 
 
 class _Damaged(ValueError):
@@ -40,7 +41,7 @@ def read_mat5(path: Path, name: str) -> np.ndarray:
     found = []
     data, order = _opened(path)
     try:
-        for kind, content in _elements(data[_HEADER:], order):
+        for kind, content in _elements(memoryview(data)[_HEADER:], order):
             called, values = _variable(path, kind, content, order, name)
             if values is not None:
                 return values
@@ -59,7 +60,7 @@ def _opened(path: Path) -> tuple[bytes, str]:
     return data, order
 
 
-def _elements(data: bytes, order: str) -> Iterator[Element]:
+def _elements(data: Bytes, order: str) -> Iterator[Element]:
     """Yields the elements that follow one another; a short one has its content in its head."""
     at = 0
     while at < len(data):
@@ -75,7 +76,7 @@ def _elements(data: bytes, order: str) -> Iterator[Element]:
         at = at + 8 if short else start + size + (0 if kind == _COMPRESSED else -size % 8)
 
 
-def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) -> tuple[str, np.ndarray | None]:
+def _variable(path: Path, kind: int, content: Bytes, order: str, wanted: str) -> tuple[str, np.ndarray | None]:
     """Returns the name of a variable, and its values where it is the one that is wanted."""
     begin = zlib.decompressobj().decompress(content, _BEGIN) if kind == _COMPRESSED else content
     if kind == _COMPRESSED:
@@ -106,13 +107,13 @@ def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
     data, order = _opened(path)
     left = ROOM + PACKED_AT_MOST * len(data)
     try:
-        for kind, content in _elements(data[_HEADER:], order):
+        for kind, content in _elements(memoryview(data)[_HEADER:], order):
             if kind == _COMPRESSED:
                 content = zlib.decompressobj().decompress(content, left + 1)
                 left -= len(content)
                 if left < 0:
                     raise _Damaged(f"its variables claim more than {ROOM + PACKED_AT_MOST * len(data)} bytes")
-                kind, content = next(_elements(content, order), (0, b""))
+                kind, content = next(_elements(memoryview(content), order), (0, b""))
             if kind == _MATRIX:
                 name, values = _matrix(content, order)
                 found |= {name: values} if values is not None else _fields(content, order)
@@ -121,7 +122,7 @@ def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
     return found
 
 
-def _matrix(content: bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarray] | None]:
+def _matrix(content: Bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarray] | None]:
     """Returns name and values of a matrix, a list of those of a cell; None of what is neither numbers nor cells of them."""
     flags, shape, name, used = _head(content, order)
     rest = memoryview(content)[used:]
@@ -134,7 +135,7 @@ def _matrix(content: bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarr
     return name, None if dtype is None else _numbers(rest, dtype, shape, name, order)
 
 
-def _fields(content: bytes, order: str) -> dict[str, np.ndarray | list[np.ndarray]]:
+def _fields(content: Bytes, order: str) -> dict[str, np.ndarray | list[np.ndarray]]:
     """Returns what `_matrix` does of each field of a struct, by ``struct/field``, a list of an array of several structs; {} of
     anything else. Structs in structs are passed over.
     """
@@ -182,7 +183,7 @@ def _numbers(content: memoryview, dtype: np.dtype, shape: tuple[int, ...], name:
     return values.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
 
 
-def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
+def _head(data: Bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
     """Returns flags, shape and name of a matrix, and how many bytes these take."""
     parts: list[Any] = []
     at = 0

@@ -127,10 +127,8 @@ def _refuse_equal_names(sources: list[Source]) -> None:
 
 def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) -> Report:
     """Copies (file, index, new label or None for its own), or leaves a file as it is that was made of the same."""
-    report = Report(skipped=copy.skipped)
     if not copy.force and already_made(copy.output, copy.provenance, CloudsReader):
-        report.was_complete = True
-        return count_samples(report, copy.output)
+        return count_samples(Report(was_complete=True), copy.output)
     files = OpenFiles()
 
     def read(place: int) -> CloudSequence:
@@ -141,7 +139,7 @@ def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) ->
         copy_samples(copy, read)
     finally:
         files.close()
-    return count_samples(report, copy.output)
+    return count_samples(Report(), copy.output)
 
 
 def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:

@@ -12,7 +12,7 @@ from dpcli.path_names import first_names
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.runtime.progress import log
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.file import file_kind, read_positions
+from dpcli.store.file import file_kind
 from dpcli.store.schema import fields_of, find_field
 from dpcli.store.sequence import OF_PARTS
 
@@ -23,8 +23,7 @@ _OPEN = 64  # files held open at a time; shards are read in turn, and there may 
 class Source:
     """Holds what the index of one file says; its points stay on the disk.
 
-    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped,
-    where the file is a shard. others: its data sets that no sample is made of. parts: how many its poses and joints
+    made_by: the reader's name. others: its data sets that no sample is made of. parts: how many its poses and joints
     have. prefix: what goes before its samples' names in the joined file.
     """
 
@@ -38,7 +37,6 @@ class Source:
     fields: tuple[str, ...] = ()
     provenance: list[dict[str, Any]] = field(default_factory=list)
     skipped: list[tuple[str, str]] = field(default_factory=list)
-    positions: tuple[list[int], list[int]] | None = None
     shard: Shard | None = None
     others: list[str] = field(default_factory=list)
     parts: int = 0
@@ -75,7 +73,6 @@ def read_source(path: Path) -> Source:
             fields=reader.fields,
             provenance=reader.provenance,
             skipped=reader.skipped,
-            positions=read_positions(reader.file),
             shard=found[0] if found else None,
             others=[name for name in reader.file if find_field(known, name) is None],
             parts=max(

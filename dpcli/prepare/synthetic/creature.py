@@ -5,7 +5,7 @@ They look along +z, y is up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -70,10 +70,10 @@ class Creature:
             index = self.bone(f"{name}_{k}", parent if k == 0 else f"{name}_{k - 1}", points[k])
             self.shape(index, points[k], points[k + 1], radii[k], radii[k + 1], paint, **more)
 
-    def add_eyes(self, bone: str, center: np.ndarray, direction: tuple[float, float, float], radius: float) -> None:
-        """Adds two eyes, mirrored at the middle of the head."""
+    def add_eyes(self, center: np.ndarray, direction: tuple[float, float, float], radius: float) -> None:
+        """Adds two eyes to the bone ``head``, mirrored at its middle."""
         for side in (-1, 1):
-            self.eyes.append((self.index(bone), center, np.array(direction) * [side, 1, 1], radius))
+            self.eyes.append((self.index("head"), center, np.array(direction) * [side, 1, 1], radius))
 
 
 def quadruped(rng: np.random.Generator) -> Creature:
@@ -111,7 +111,7 @@ def _head(animal: Creature, crown: np.ndarray, girth: float, rng: np.random.Gene
     animal.shape(
         head, tip + [0, 0.12 * size, 0.3 * size], tip + [0, 0.14 * size, 0.32 * size], 0.17 * size, 0.17 * size, "dark"
     )
-    animal.add_eyes("head", middle, (0.72, 0.42, 0.62), 0.17 * size)
+    animal.add_eyes(middle, (0.72, 0.42, 0.62), 0.17 * size)
     ear, out, width = u(0.9, 1.9) * size, u(0.15, 0.6), u(0.3, 0.45) * size
     for side, sign in (("left", 1), ("right", -1)):
         root = middle + size * np.array([0.55 * sign, 0.72, -0.25])
@@ -127,7 +127,7 @@ def _leg(animal: Creature, name: str, parent: str, top: np.ndarray, girth: float
     ankle = np.array([top[0], 0.13 * top[1], top[2] - 0.6 * bend])
     sole = np.array([top[0], 0.22 * thick, ankle[2] + 0.05])
     animal.limb(name, parent, [top, knee, ankle, sole], [1.25 * thick, 0.68 * thick, 0.42 * thick, 0.45 * thick])
-    animal.shapes[-1] = Shape(*(getattr(animal.shapes[-1], key) for key in ("bone", "a", "b", "ra", "rb")), "dark")
+    animal.shapes[-1] = replace(animal.shapes[-1], paint="dark")
 
 
 def bird(rng: np.random.Generator) -> Creature:
@@ -144,7 +144,7 @@ def bird(rng: np.random.Generator) -> Creature:
     animal.shape(
         head, crown + [0, 0, 0.06], crown + [0, -0.02, 0.07 + u(0.07, 0.16)], 0.3 * girth, 0.07 * girth, "horn"
     )
-    animal.add_eyes("head", crown + [0, 0.01, 0.03], (0.8, 0.35, 0.4), 0.14 * girth)
+    animal.add_eyes(crown + [0, 0.01, 0.03], (0.8, 0.35, 0.4), 0.14 * girth)
     animal.limb("tail", "body", [(0, 0, -0.26), (0, 0.01, -0.26 - u(0.15, 0.3))], [0.07, 0.13], "fin", flat=0.16)
     for side, sign in (("left", 1), ("right", -1)):
         points = [np.array([sign * x * span, 0.04, z]) for x, z in ((0.08, 0.05), (0.5, 0.06), (1.0, -0.08))]
@@ -175,5 +175,5 @@ def fish(rng: np.random.Generator) -> Creature:
         index = animal.bone(f"fin_{name}", "front", root)
         tip = root + np.array([sign * 0.12, -0.05, -0.12])
         animal.shape(index, root, tip, 0.035, 0.06, "fin", flat=0.28, normal=(0.0, 0.92, -0.38))
-    animal.add_eyes("head", np.array([0, 0.12 * deep, z[0] - 0.03]), (1.0, 0.25, 0.25), 0.17 * deep)
+    animal.add_eyes(np.array([0, 0.12 * deep, z[0] - 0.03]), (1.0, 0.25, 0.25), 0.17 * deep)
     return animal

@@ -64,9 +64,9 @@ def _step(animal: Creature, w: np.ndarray, gait: str) -> tuple[Turns, np.ndarray
     return turns, np.stack([0 * w, bounce * np.cos(2 * w), forward], axis=1)
 
 
-def _even(w: np.ndarray, edge: float = 0.96) -> np.ndarray:
+def _even(w: np.ndarray) -> np.ndarray:
     """Returns a rounded zigzag of height 1: a leg on the ground swings back evenly, as the body passes over it."""
-    return np.arcsin(edge * np.sin(w)) / np.arcsin(edge)
+    return np.arcsin(0.96 * np.sin(w)) / np.arcsin(0.96)
 
 
 def _wag(w: np.ndarray) -> tuple[Turns, np.ndarray]:

@@ -144,15 +144,16 @@ def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[Mesh
     if held_out and not Path(held_out).is_file():
         raise DataError(f"--held-out {held_out}: {why_unreadable(held_out) or 'no such file'}")
     text = read_text(Path(held_out)) if held_out else ""
-    ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
-    for end in ends:
-        if not any(_ends_with(path, end) for path in paths):
+    named = dict.fromkeys(end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end)
+    ends = [_ends(path) & named.keys() for path in paths]
+    found = set().union(*ends)
+    for end in named:
+        if end not in found:
             raise DataError(
                 f"{held_out}: {end} is none of the {len(paths)} models; name paths, or ends of paths, below them"
             )
-    files = [MeshFile(path, names_of_clips(path)) for path in paths]
-    held = [file for file in files if any(_ends_with(file.path, end) for end in ends)]
-    return [file for file in files if file not in held], held
+    files = [(MeshFile(path, names_of_clips(path)), held) for path, held in zip(paths, ends)]
+    return [file for file, held in files if not held], [file for file, held in files if held]
 
 
 def _models_in(place: Path) -> list[Path]:
@@ -169,8 +170,10 @@ def _models_in(place: Path) -> list[Path]:
     return found
 
 
-def _ends_with(path: Path, end: str) -> bool:
-    return ("/" + path.as_posix()).endswith("/" + end)
+def _ends(path: Path) -> set[str]:
+    """Returns a path and all ends of it that begin with the name of a folder or file."""
+    parts = path.as_posix().split("/")
+    return {"/".join(parts[place:]) for place in range(len(parts))}
 
 
 def made_creature(rng: np.random.Generator) -> AnimatedMesh:

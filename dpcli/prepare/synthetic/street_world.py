@@ -20,7 +20,6 @@ class Mover:
     start (2): meters; heading, turn: radians and radians per second; speed: m/s.
     """
 
-    kind: str
     triangles: np.ndarray
     start: np.ndarray
     heading: float
@@ -163,9 +162,9 @@ def _draw_mover(kind: str, rng: np.random.Generator) -> Mover:
         side = rng.choice((-1, 1)) * (_ROAD / 2 + rng.uniform(0.8, 2.2))
         across = rng.uniform() < 0.3
         start = np.array([x, rng.uniform(-3, 3) if across else side])
-        return Mover(kind, person(rng), start, heading + (np.pi / 2 if across else 0), rng.uniform(0.9, 1.9), legs=2)
+        return Mover(person(rng), start, heading + (np.pi / 2 if across else 0), rng.uniform(0.9, 1.9), legs=2)
     start = np.array([x, lane * (rng.uniform(0.8, 1.1) if kind != "cyclist" else 1.5)])
     if kind == "cyclist":
-        return Mover(kind, cyclist(rng), start, heading, rng.uniform(2.5, 7))
+        return Mover(cyclist(rng), start, heading, rng.uniform(2.5, 7))
     shape = car(rng) if kind == "car" else bus(rng)
-    return Mover(kind, shape, start, heading, rng.uniform(2, 15), rng.normal(0, 0.05))
+    return Mover(shape, start, heading, rng.uniform(2, 15), rng.normal(0, 0.05))

@@ -52,7 +52,7 @@ def _round_figure(rng: np.random.Generator) -> Creature:
         animal.shape(bone, spine[k], spine[k + 1], girths[k], girths[k + 1])
     head = animal.bone("head", "spine_2", spine[3])
     animal.shape(head, spine[3], spine[3] + [0, 0.02, 0], girths[3], girths[3])
-    animal.add_eyes("head", spine[3], (u(0.2, 0.5), u(-0.1, 0.4), 0.85), u(0.08, 0.35) * girths[3])
+    animal.add_eyes(spine[3], (u(0.2, 0.5), u(-0.1, 0.4), 0.85), u(0.08, 0.35) * girths[3])
     if rng.random() < 0.4:
         tip = spine[3] + girths[3] * np.array([0, u(-0.4, 0.1), u(1.1, 1.5)])
         animal.shape(head, spine[3], tip, u(0.1, 0.3) * girths[3], u(0.05, 0.2) * girths[3], "horn")
@@ -120,7 +120,7 @@ def _neck_and_head(animal: Creature, start: np.ndarray, girth: float, upright: b
         tip = middle + snout * np.array([0, np.sin(droop), np.cos(droop)])
         paint = "horn" if rng.random() < 0.2 else "coat"
         animal.shape(head, middle, tip, 0.7 * size, u(0.1, 0.6) * size, paint)
-    animal.add_eyes("head", middle, (0.75, 0.4, 0.6), u(0.08, 0.25) * size)
+    animal.add_eyes(middle, (0.75, 0.4, 0.6), u(0.08, 0.25) * size)
     if rng.random() < 0.7:
         paint = "horn" if rng.random() < 0.4 else "coat"
         long, out, back = u(0.4, 2.2) * size, u(0, 1.3), u(-0.8, 0.5)

@@ -53,7 +53,17 @@ def test_times_beside_depth_are_those_of_its_frames(tmp_path, form, name, values
     assert np.allclose(read(path, fps=5)[0].time, 2 * SECONDS)
 
 
-@pytest.mark.parametrize("values", [np.zeros(FRAMES), np.arange(FRAMES - 1) * 0.1, np.arange(FRAMES), SECONDS[::-1]])
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.zeros(FRAMES),
+        np.arange(FRAMES - 1) * 0.1,
+        np.arange(FRAMES),
+        SECONDS[::-1],
+        np.where(SECONDS == 0, np.nan, SECONDS),
+        np.where(SECONDS == 0, -np.inf, SECONDS),
+    ],
+)
 def test_times_that_do_not_fit_are_named(tmp_path, values):
     sequence, notes = read(write(tmp_path / "a.h5", {"depth": DEPTH, "time": values}))
     assert sequence.time is None and "arrays that are not read (time)" in notes
@@ -75,6 +85,15 @@ def test_a_camera_and_a_unit_in_single_numbers_of_hdf5_are_used(tmp_path, place)
 def test_the_unit_of_depth_in_whole_numbers_counts(tmp_path, unit, scale):
     found, _ = read(write(tmp_path / "a.h5", {"depth": DEPTH}, units=unit))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+
+
+def test_doubles_of_matlab_that_mark_what_is_unseen_are_millimeters_too(tmp_path):
+    depth = DEPTH.astype(float)
+    depth[0, 0, :3] = np.nan, np.inf, -np.inf
+    reader = DepthVideos(inputs=(write(tmp_path / "a.mat", {"depth": depth.transpose(0, 2, 1)}),))
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    assert np.allclose(sample.sequence.points[:, 2], DEPTH.ravel()[3:] / 1000)
+    assert sample.notes["pixels without a depth (NaN, 65535 and the like) dropped"] == 3
 
 
 def test_depth_in_meters_needs_no_scale_of_attributes(tmp_path):

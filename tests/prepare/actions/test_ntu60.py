@@ -20,8 +20,8 @@ from dpcli.prepare.decode import zip_folders
 from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.store import CloudsReader
+from tests.support.commands import told as dpc
 from tests.support.depth_png_helpers import ntu_files, person, png_bytes, write_files
-from tests.support.prepare_helpers import dpc
 
 RNG = np.random.default_rng(0)
 ONE, TWO = "S001C002P003R001A060", "S017C001P001R002A001"

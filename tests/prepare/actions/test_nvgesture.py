@@ -134,8 +134,9 @@ def test_camera_coordinates_project_back_onto_the_pixels(tmp_path):
     row, column, gray = image.read(item, RNG).sequence.points.T
     x, y, z = camera.read(item, RNG).sequence.points.T
     np.testing.assert_allclose(z, 255 - gray)
-    np.testing.assert_allclose(x / z * INTRINSICS.fx + INTRINSICS.cx, column, atol=1e-3)
-    np.testing.assert_allclose(y / z * INTRINSICS.fy + INTRINSICS.cy, row, atol=1e-3)
+    # of pixels that are four times as wide and high as those of the data set, counted from the middle of the first
+    np.testing.assert_allclose((x / z * INTRINSICS.fx + INTRINSICS.cx + 0.5) / 4 - 0.5, column, atol=1e-3)
+    np.testing.assert_allclose((y / z * INTRINSICS.fy + INTRINSICS.cy + 0.5) / 4 - 0.5, row, atol=1e-3)
 
 
 def test_of_several_lists_it_is_told_which_is_read(tmp_path):

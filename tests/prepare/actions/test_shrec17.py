@@ -63,6 +63,17 @@ def test_steps_can_be_left_out():
     assert ((keep_only_hand(depth, 0, 0) == depth) | (depth == 120)).all()
 
 
+@pytest.mark.parametrize("close", range(1, 9))
+def test_a_closing_fills_and_takes_nothing_away(close):
+    """Also one by a square of an even side, which has no middle."""
+    mask = ndimage.binary_opening(RNG.random((40, 50)) < 0.9, np.ones((4, 4), bool))
+    mask[:10], mask[-10:], mask[:, :10], mask[:, -10:] = False, False, False, False
+    closed = ndimage.binary_closing(mask, np.ones((close, close), bool))
+    labels, _ = ndimage.label(closed)
+    expected = (labels == np.bincount(labels[labels > 0]).argmax()) & mask
+    assert np.array_equal(keep_only_hand(np.uint16(mask) * 500, 0, close) > 0, expected)
+
+
 def test_image_coordinates_are_pixels_of_the_whole_frame(tmp_path):
     reader = Shrec17(make_raw(tmp_path))
     sequence = reader.read(reader.items()[0], RNG).sequence

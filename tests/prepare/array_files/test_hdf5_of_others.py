@@ -155,6 +155,30 @@ def test_variables_of_octave_have_their_own_names(tmp_path, suffix):
         np.testing.assert_allclose(sequence.time, np.arange(6) / 10)
 
 
+def test_texts_of_matlab_are_no_numbers(tmp_path):
+    """Those of version 7.3 are stored as the numbers of their letters, in cells, too."""
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+
+        def save(name, values, kind):
+            file[name] = values
+            file[name].attrs["MATLAB_class"] = np.bytes_(kind)
+            return file[name].ref
+
+        def letters(text):
+            return np.array([[ord(letter)] for letter in text], np.uint16)
+
+        frames = [save(f"#refs#/f{t}", cloud.T[:, : 40 - t], "single") for t, cloud in enumerate(clouds())]
+        words = [save(f"#refs#/w{t}", letters("walk" + "." * t), "char") for t in range(6)]
+        save("data", np.array([frames], h5py.ref_dtype), "cell")
+        save("names", np.array([words], h5py.ref_dtype), "cell")
+        save("label", letters("a"), "char")
+    reader = ArraySequences(tmp_path / "a.mat")
+    (item,) = reader.items()
+    assert item.label == -1 and "not read: label, names" in reader.summary([item])[0]
+    expected = [cloud[: 40 - t] for t, cloud in enumerate(clouds())]
+    assert all(np.array_equal(a, b) for a, b in zip(frames_of(tmp_path / "a.mat"), expected, strict=True))
+
+
 def test_what_lies_in_another_file_is_named_and_not_followed(tmp_path):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["points"] = clouds()
@@ -188,3 +212,23 @@ def test_sequences_of_a_file_of_many_arrays_are_opened_by_name(tmp_path, monkeyp
     )
     sample = reader.read(items[7], np.random.default_rng(0)).sequence
     assert np.allclose(sample.points, (clouds()[:5] + 7).reshape(-1, 3)) and len(set(looked)) == 5
+
+
+def test_a_cell_of_many_sequences_is_read_once(tmp_path, monkeypatch):
+    """Each of its sequences would else read those of all others."""
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        places = []
+        for walk in range(20):
+            file[f"#refs#/{walk}"] = (clouds() + walk).T
+            places.append(file[f"#refs#/{walk}"].ref)
+        file["walks"] = np.array([places], h5py.ref_dtype)
+        file["walks"].attrs["MATLAB_class"] = np.bytes_("cell")
+    looked, read = [], containers._cells
+    monkeypatch.setattr(
+        containers, "_cells", lambda file, item, path: looked.append(item.name) or read(file, item, path)
+    )
+    reader = ArraySequences(tmp_path / "a.mat")
+    for walk, item in enumerate(reader.items()):
+        sample = reader.read(item, np.random.default_rng(0)).sequence
+        assert np.allclose(sample.points, (clouds() + walk).reshape(-1, 3))
+    assert walk == 19 and looked == ["/walks"]

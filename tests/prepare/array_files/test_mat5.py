@@ -14,7 +14,8 @@ from scipy.io import loadmat, savemat
 
 from dpcli.errors import DataError
 from dpcli.prepare.array_files.mat5 import read_mat5, read_variables
-from tests.support.prepare_helpers import dpc, write_msr
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import write_msr
 
 RNG = np.random.default_rng(0)
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]

@@ -21,7 +21,8 @@ from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from tests.support.prepare_helpers import ROOT, ToyReader, dpc
+from tests.support.commands import told as dpc
+from tests.support.prepare_helpers import ROOT, ToyReader
 
 
 def write(path: Path, names: list[str], classes: list[str], **options) -> Path:
@@ -160,6 +161,12 @@ def test_what_does_not_fit_is_refused(two, tmp_path):
         merge([two[0], tmp_path / "text.h5"], tmp_path / "x.h5")
 
 
+def test_a_label_map_knows_the_classes_of_all_files_of_one_name(tmp_path):
+    sources = [(tmp_path / "one" / "train.h5", ["wave"]), (tmp_path / "two" / "train.h5", ["push"])]
+    for labels in (LabelMap(labels={"wave": "hello"}), LabelMap(files={"train.h5": {"wave": "hello"}})):
+        assert labels.resolve(sources) == (["hello", "push"], [[0], [1]])
+
+
 def test_fields_that_not_all_have_are_left_out(tmp_path):
     paths = [
         write(tmp_path / "a.h5", ["a"], [], fields=["time", "track"]),
@@ -173,7 +180,7 @@ def test_fields_that_not_all_have_are_left_out(tmp_path):
 
 def test_the_command(two, tmp_path):
     (tmp_path / "map.json").write_text(json.dumps({"labels": {"g1": "push"}}))
-    done = dpc("prepare", "merge", *two, "-o", tmp_path / "all.h5", "--labels", tmp_path / "map.json", "-q")
+    done = dpc("prepare", "merge", *two, "-o", tmp_path / "all.h5", "--labels", tmp_path / "map.json")
     assert (
         done.returncode == 0 and done.stdout == f"{tmp_path / 'all.h5'}: 5 sequences, 5 frames, 14 points, 2 skipped\n"
     )

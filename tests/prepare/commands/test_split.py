@@ -16,7 +16,7 @@ from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.commands.sources import read_source
 from dpcli.prepare.commands.split import SplitChoice, draw_splits, split, splits_by_list
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from tests.support.prepare_helpers import dpc
+from tests.support.commands import told as dpc
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_impossible_choices(whole, tmp_path):
 
 
 def test_the_command(whole, tmp_path):
-    done = dpc("prepare", "split", whole, "-o", tmp_path / "d", "--train-subjects", "1,2", "-q")
+    done = dpc("prepare", "split", whole, "-o", tmp_path / "d", "--train-subjects", "1,2")
     assert done.returncode == 0 and done.stdout == "train: 6 sequences\ntest: 6 sequences\n"
     assert sorted(parts(tmp_path / "d")) == ["test", "train"]
     wrong = dpc("prepare", "split", whole, "-o", tmp_path / "e", "--fractions", "0.5,0.5")

@@ -35,8 +35,8 @@ def street() -> CloudSequence:
     rng = np.random.default_rng(3)
     standing = standing_street(rng)
     movers = [
-        Mover("car", car(rng), np.array([14.0, 1.75]), np.pi, 9.0),
-        Mover("person", person(rng), np.array([6.0, -4.6]), 0.0, 1.8, legs=2),
+        Mover(car(rng), np.array([14.0, 1.75]), np.pi, 9.0),
+        Mover(person(rng), np.array([6.0, -4.6]), 0.0, 1.8, legs=2),
     ]
     return scanned(standing, movers, rng, LIDAR)
 
@@ -93,7 +93,7 @@ def test_what_moves_is_found_and_the_rest_stands():
 def test_the_side_of_a_car_that_comes_near_is_no_object_of_its_own():
     rng = np.random.default_rng(2)
     standing, lidar = standing_street(rng), Lidar(tuple(np.linspace(2, -22, 48)), 900, 60.0)
-    sequence = scanned(standing, [Mover("car", car(rng), np.array([15.0, 1.75]), np.pi, 9.0)], rng, lidar)
+    sequence = scanned(standing, [Mover(car(rng), np.array([15.0, 1.75]), np.pi, 9.0)], rng, lidar)
     label = np.concatenate(explained(sequence)[0])
     assert len(np.unique(label[sequence.part > 0])) == 2 and (label[sequence.part > 0] == 1).mean() > 0.9
 
