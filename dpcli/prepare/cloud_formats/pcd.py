@@ -55,7 +55,8 @@ def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
         columns = _read_compressed(path, body, header)
     shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
     posed = {POSED: 1} if header.posed else {}
-    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed, unit=header.unit)
+    cloud = cloud_of_columns(path, shown, keep)
+    return replace(cloud, dropped=beyond | posed, unit=cloud.unit or header.unit)
 
 
 def _read_header(path: Path, data: bytes) -> Header:

@@ -70,7 +70,7 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
             return unpack_supersplat(path, chunks, rows, keep)
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
             cloud = cloud_of_columns(path, _read_with_lists(path, vertex), keep)
-            return replace(cloud, unread=cloud.unread + tuple(vertex.lists), unit=unit)
+            return replace(cloud, unread=cloud.unread + tuple(vertex.lists), unit=cloud.unit or unit)
         if order:
             columns, rest = _read_binary(path, file, order, vertex, before)
         else:
@@ -78,7 +78,8 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
         if order and behind:
             _require_elements(path, file, order, behind)
             rest = {}
-    return replace(cloud_of_columns(path, columns, keep), dropped=rest, unit=unit)
+    cloud = cloud_of_columns(path, columns, keep)
+    return replace(cloud, dropped=rest, unit=cloud.unit or unit)
 
 
 def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:

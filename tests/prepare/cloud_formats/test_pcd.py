@@ -117,6 +117,16 @@ def test_several_blanks_decimal_commas_and_an_old_version(tmp_path):
     np.testing.assert_array_equal(points, [[1.5, 2, 3], [4, 5.25, np.nan]])
 
 
+def test_units_in_names_count_before_those_in_comments(tmp_path):
+    for names, said, unit in (
+        ("x_mm y_mm z_mm", "", "mm"),
+        ("x_mm y_mm z_mm", "# unit: m\n", "mm"),
+        ("x y z", "# unit: m\n", "m"),
+    ):
+        (tmp_path / "a.pcd").write_text(said + header(names) + "1 2 3\n4 5 6\n")
+        assert read_pcd(tmp_path / "a.pcd").unit == unit
+
+
 def test_numbers_of_a_compressed_field_lie_point_after_point(tmp_path):
     """As PCL packs them: all numbers of a field's first point, then those of its second."""
     points, normals = np.arange(9, dtype="<f4").reshape(3, 3), np.arange(10, 19, dtype="<f4").reshape(3, 3)
