@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_points, without
+from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_names, require_points, without
 from dpcli.prepare.cloud_formats.laz_chunks import check_chunks
 from dpcli.store.schema import METERS
 
@@ -54,7 +54,8 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     color = np.stack([np.asarray(las[name]) for name in _COLORS], axis=1) if set(_COLORS) <= set(names) else None
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
-    extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
+    require_names(path, names, keep)
+    extra = kept_columns(path, {name: np.asarray(las[name]) for name in keep}, keep)
     unread = without(names, "XYZ", _COLORS, _ABOUT_RETURNS, keep)
     unit, heights = _units(path, las)
     points = _scaled(las)
