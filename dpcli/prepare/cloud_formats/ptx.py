@@ -38,7 +38,7 @@ def _scans(path: Path, lines: list[str]) -> Iterator[np.ndarray]:
     start = 0
     while start < len(lines) or not start:
         header = [_numbers(line) for line in lines[start : start + len(_HEADER)]]
-        if tuple(map(len, header)) != _HEADER or not all(one[0] == int(one[0]) >= 0 for one in header[:2]):
+        if tuple(map(len, header)) != _HEADER or not all(one[0].is_integer() and one[0] >= 0 for one in header[:2]):
             raise DataError(
                 f"{path}: row {start + 1} begins no scan; expected its columns, rows, axes and a 4x4 matrix"
             )

@@ -206,9 +206,10 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
     (tmp_path / "a.ptx").write_text("\n".join(scans[:-1]))
     with pytest.raises(DataError, match="says 6 points, it has room for 5"):
         read_cloud(tmp_path / "a.ptx")
-    (tmp_path / "a.ptx").write_text("\n".join(scans[1:]))
-    with pytest.raises(DataError, match="row 1 begins no scan"):
-        read_cloud(tmp_path / "a.ptx")
+    for lines in (scans[1:], ["nan", *scans[1:]], ["inf", *scans[1:]], ["2.5", *scans[1:]], ["-3", *scans[1:]]):
+        (tmp_path / "a.ptx").write_text("\n".join(lines))
+        with pytest.raises(DataError, match="row 1 begins no scan"):
+            read_cloud(tmp_path / "a.ptx")
 
 
 def test_a_ptx_written_by_its_description_gives_the_places_in_the_world(tmp_path):
@@ -251,6 +252,11 @@ def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_pat
 def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
     cloud = read(tmp_path / f"a.{suffix}", text, keep=["snr"] if "snr" in text else [])
     assert cloud.points.shape == (0, 3) and (cloud.color is not None) == ("r,g,b" in text)
+
+
+def test_a_column_to_keep_that_is_not_there_is_told_with_those_that_are(tmp_path):
+    with pytest.raises(DataError, match="no column snr among those to read; found x, y, z, SNR, t"):
+        read(tmp_path / "a.csv", "x,y,z,SNR,t\n1,2,3,4,5\n", keep=["snr"])
 
 
 def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
