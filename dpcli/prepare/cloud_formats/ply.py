@@ -96,7 +96,7 @@ def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
             order = _ORDERS.get(words[1])
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             elements.append(Element(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             elements[-1].properties.append((words[-1], _property_type(path, words)))

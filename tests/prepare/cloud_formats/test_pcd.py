@@ -100,13 +100,15 @@ def test_a_color_of_a_text_that_is_no_number_is_none(tmp_path):
         (header() + "1,5 2,5 3\n1 2 word\n", ":12: column 'z' holds 'word'"),
         (header(size="4 4") + "1 2 3\n", "have different lengths"),
         (header(size="4 4 3") + "1 2 3\n", "field z has TYPE F SIZE 3"),
+        (header(size="4 4 ²") + "1 2 3\n", "field z has TYPE F SIZE "),
+        (header(count="1 1 ²") + "1 2 3\n", "field z has COUNT "),
         (header(data="zip") + "1 2 3\n", "DATA zip; expected ascii"),
         (header(data="binary_compressed") + "12345678", "truncated or damaged"),
         ("# .PCD\n", "no number of points in its header"),
     ],
 )
 def test_what_is_damaged_is_named(tmp_path, content, message):
-    (tmp_path / "a.pcd").write_text(content)
+    (tmp_path / "a.pcd").write_text(content, "latin-1")
     with pytest.raises(DataError, match=message):
         read_pcd(tmp_path / "a.pcd")
 

@@ -133,6 +133,12 @@ def test_lists_of_vertices_are_named(tmp_path):
     assert cloud.unread == ("tags",)
 
 
+def test_a_count_that_is_no_number_is_named(tmp_path):
+    (tmp_path / "a.ply").write_text(text_ply(["1 2 3"]).replace("vertex 1", "vertex ²"), "latin-1")
+    with pytest.raises(DataError, match="no element vertex in its header"):
+        read_ply(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("ends", [" \n", "\t\n", "  \r\n"])
 def test_blanks_behind_the_header_are_no_coordinates(tmp_path, ends):
     head = text_ply([], count=3).replace("ascii", "binary_little_endian").removesuffix("\n") + ends
