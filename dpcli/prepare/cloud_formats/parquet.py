@@ -83,7 +83,8 @@ class ParquetTable:
             return None
         kind = "int32" if column.type.bit_width == 32 else "int64"
         whole = column.cast(kind)
-        first = next((value for value in whole.to_pylist() if value is not None), 0)
+        known = whole.drop_null()
+        first = known[0].as_py() if len(known) else 0
         counted = (whole.fill_null(first).to_numpy() - first) / parts
         counted = past_midnight(counted) if types.is_time(column.type) else counted
         return np.where(column.is_valid().to_numpy(), counted, np.nan)
