@@ -16,6 +16,7 @@ from dpcli.npy_files import open_archive
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
 from dpcli.prepare.articulated.articulated_object import are_rigid
+from dpcli.prepare.articulated.object_splits import counts_of_splits
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_json
@@ -153,7 +154,6 @@ class MultiBodySync:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        counts = {split: sum(item.split == split for item in items) for split in SPLITS}
-        lines = [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
+        lines = [f"{counted(len(items), 'sample')} ({counts_of_splits(item.split for item in items)})"]
         left = sorted({path.stem for path in (self.raw / "data").glob("[!.]*.npz")} - {item.name for item in items})
         return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])
