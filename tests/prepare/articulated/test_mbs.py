@@ -74,7 +74,7 @@ def test_flow_is_the_published_formula(tmp_path):
 def test_the_command(tmp_path):
     samples = {0: make_sample(0, 2)[0], 1: make_sample(1, 5)[0], 12: make_sample(2, 3)[0]}
     raw = write(tmp_path / "raw", samples, {"train": [0, 3], "val": [12], "test": [1]})
-    done = dpc("prepare", "mbs", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    done = dpc("prepare", "mbs", raw, "-o", tmp_path / "x.h5", "--item-seconds", 0, "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert "000003.npz: listed under 'train' in meta.json, but not there" in done.stderr
     with CloudsReader(tmp_path / "x.h5") as reader:
