@@ -46,11 +46,13 @@ class ParquetTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
+        from pyarrow.types import is_temporal
+
         found = []
         for place in places:
             column = self._table.column(place)
             try:
-                if _parts_of_second(column.type):
+                if is_temporal(column.type):
                     raise ValueError("times are no numbers")
                 found.append(column.to_numpy().astype(np.float64))
             except (TypeError, ValueError):
