@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, DpcError
+from dpcli.errors import DataError, DpcError, reading
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
 
@@ -28,19 +28,19 @@ class ParquetTable:
         except ImportError:
             raise DpcError('Parquet and Feather need pyarrow: pip install "dpc-toolkit[parquet]"') from None
         self.path = path
-        try:
-            if path.suffix.lower() != ".parquet":
-                self._table: Any = _read_feather(path)
-            else:
-                about = parquet.read_metadata(path)
-                require_room(path, _CELL * about.num_rows * about.num_columns)
-                self._table = parquet.read_table(path)
-        except DataError:
-            raise
-        except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
-            raise DataError(
-                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({' '.join(str(error).split())})"
-            ) from None
+        with reading(path):  # whose sentence is that of memory that ends
+            try:
+                if path.suffix.lower() != ".parquet":
+                    self._table: Any = _read_feather(path)
+                else:
+                    about = parquet.read_metadata(path)
+                    require_room(path, _CELL * about.num_rows * about.num_columns)
+                    self._table = parquet.read_table(path)
+            except (DataError, MemoryError):
+                raise
+            except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
+                kind, said = path.suffix[1:].capitalize(), " ".join(str(error).split())
+                raise DataError(f"{path}: not a readable {kind} table, perhaps truncated ({said})") from None
         self._table = self._table.flatten()  # a column of structures becomes one for each of their fields
         self.names = tuple(self._table.column_names)
 
