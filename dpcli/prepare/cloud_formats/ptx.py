@@ -13,6 +13,7 @@ from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 from dpcli.text_files import decode_text
 
 _HEADER = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)  # numbers in the lines before a scan: columns, rows, scanner, axes, matrix
+_MOST = 1e9  # columns or rows of a scan
 _NAMES = "x y z intensity red green blue".split()
 
 
@@ -38,7 +39,9 @@ def _scans(path: Path, lines: list[str]) -> Iterator[np.ndarray]:
     start = 0
     while start < len(lines) or not start:
         header = [_numbers(line) for line in lines[start : start + len(_HEADER)]]
-        if tuple(map(len, header)) != _HEADER or not all(one[0].is_integer() and one[0] >= 0 for one in header[:2]):
+        if tuple(map(len, header)) != _HEADER or not all(
+            0 <= one[0] < _MOST and one[0].is_integer() for one in header[:2]
+        ):
             raise DataError(
                 f"{path}: row {start + 1} begins no scan; expected its columns, rows, axes and a 4x4 matrix"
             )

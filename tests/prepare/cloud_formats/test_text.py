@@ -206,7 +206,14 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
     (tmp_path / "a.ptx").write_text("\n".join(scans[:-1]))
     with pytest.raises(DataError, match="says 6 points, it has room for 5"):
         read_cloud(tmp_path / "a.ptx")
-    for lines in (scans[1:], ["nan", *scans[1:]], ["inf", *scans[1:]], ["2.5", *scans[1:]], ["-3", *scans[1:]]):
+    for lines in (
+        scans[1:],
+        ["nan", *scans[1:]],
+        ["inf", *scans[1:]],
+        ["1e200", "1e200", *scans[2:]],
+        ["2.5", *scans[1:]],
+        ["-3", *scans[1:]],
+    ):
         (tmp_path / "a.ptx").write_text("\n".join(lines))
         with pytest.raises(DataError, match="row 1 begins no scan"):
             read_cloud(tmp_path / "a.ptx")
