@@ -23,6 +23,7 @@ def read_ptx(path: Path, keep: Sequence[str] = ()) -> Cloud:
     Raises DataError when a scan's header is none, or a scan holds fewer points than it says.
     """
     scans = list(_scans(path, [line for line in decode_text(path).split("\n") if line.strip()]))
+    scans = [scan for scan in scans if len(scan)] or scans[:1]  # one without points has no columns to compare
     if len({scan.shape[1] for scan in scans}) != 1:
         raise DataError(
             f"{path}: its scans have different columns; expected x y z intensity, and perhaps colors, in all"

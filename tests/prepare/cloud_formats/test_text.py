@@ -198,7 +198,8 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
         head = ["3", "2", *(" ".join(map(str, row)) for row in [[0, 0, 0], *np.eye(3).tolist(), *matrix.tolist()])]
         scans += [*head, *(" ".join(map(str, [*point.tolist(), 0.5, *(color or [])])) for point in own)]
         expected.append(np.delete(own, 2, 0) @ turn + matrix[3, :3])
-    (tmp_path / "a.ptx").write_text("\r\n".join(scans) + "\r\n")
+    empty = ["0", "0", *scans[2:10]]
+    (tmp_path / "a.ptx").write_text("\r\n".join([*empty, *scans, *empty]) + "\r\n")
     cloud = read_cloud(tmp_path / "a.ptx", keep=["intensity"])
     np.testing.assert_allclose(cloud.points, np.concatenate(expected), atol=1e-9)
     assert cloud.dropped == {AT_ORIGIN: 2} and cloud.extra["intensity"].tolist() == [0.5] * 10
