@@ -481,10 +481,9 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
         found = archived_depth(path)
         frames = depth_frames(path, found.depth)
         told = _told_beside(path, found, len(frames))
-        time = told["time"]
-        return DepthVideo(
-            np.ascontiguousarray(frames[::stride]), **{**told, "time": None if time is None else time[::stride]}
-        )
+        if told["time"] is not None:
+            told["time"] = told["time"][::stride]
+        return DepthVideo(np.ascontiguousarray(frames[::stride]), **told)
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
     from dpcli.prepare.decode.video_streams import how_shown
