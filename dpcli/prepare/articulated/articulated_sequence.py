@@ -127,7 +127,7 @@ def draw_sequence(
             poses_of_parts[:, part[body]] = poses[:, body]
     joint = true_joints(obj, locked, values, poses, scale, padded)
     sequence = CloudSequence.from_frames(name, list(clouds), part=list(ids), pose=poses_of_parts, joint=joint, **known)
-    return Sample(sequence, _notes(studied, clouds, ids, options))
+    return Sample(sequence, _notes(studied, clouds, ids, int(part.max()) + 1, options))
 
 
 def _normalized(obj: ArticulatedObject, poses: np.ndarray) -> tuple[float, np.ndarray]:
@@ -192,8 +192,8 @@ def _camera(
     return Camera.random(float(radius), options.orientation == "upright", rng)
 
 
-def _notes(studied: Study, clouds: tuple, ids: tuple, options: Articulation) -> dict[str, int]:
+def _notes(studied: Study, clouds: tuple, ids: tuple, num_parts: int, options: Articulation) -> dict[str, int]:
     few = sum(len(cloud) < options.points_per_frame for cloud in clouds)
-    unseen = sum(len(np.unique(part)) < max(p.max() for p in ids) + 1 for part in ids)
+    unseen = sum(len(np.unique(part)) < num_parts for part in ids)
     found = {"frames with fewer points than asked for": few, "frames in which not every part is seen": unseen}
     return {**studied.notes, **{what: count for what, count in found.items() if count}}

@@ -15,11 +15,13 @@ from dpcli.errors import DataError
 from dpcli.npy_files import open_archive
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
+from dpcli.prepare.articulated.articulated_object import are_rigid
+from dpcli.prepare.articulated.object_splits import counts_of_splits
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
 from dpcli.text_files import read_json
 
-_RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
+_MOST_PARTS = 1000  # of a sample
 
 
 @lru_cache(maxsize=4)
@@ -44,15 +46,22 @@ def most_parts(raw: Path) -> int:
     for numbers in read_meta(raw).values():
         for number in numbers:
             try:
-                most = max(most, int(_segmentation(raw / "data" / f"{number:06d}.npz").max()))
+                path = raw / "data" / f"{number:06d}.npz"
+                with open_archive(path) as archive:
+                    most = max(most, int(_part_ids(archive, path).max()))
             except (DataError, OSError, zipfile.BadZipFile):
                 continue  # read() will say what is wrong with it
     return most
 
 
-def _segmentation(path: Path) -> np.ndarray:
-    with open_archive(path) as archive:
-        return read_npz_member(archive, path, "segm")
+def _part_ids(archive: zipfile.ZipFile, path: Path) -> np.ndarray:
+    """Reads the parts of the points, which count from 1. Raises DataError when they are something else."""
+    segm = read_npz_member(archive, path, "segm")
+    if segm.dtype.kind not in "iu" or not segm.size:
+        raise DataError(f"{path}: segm is {segm.dtype} {segm.shape}; expected whole numbers (views, points)")
+    if segm.min() < 1 or segm.max() > _MOST_PARTS:
+        raise DataError(f"{path}: segm holds ids from {segm.min()} to {segm.max()}; expected 1 to the number of parts")
+    return segm
 
 
 def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -65,7 +74,7 @@ def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     try:
         with open_archive(path) as archive:
             points = read_npz_member(archive, path, "pc")
-            segm = read_npz_member(archive, path, "segm")
+            segm = _part_ids(archive, path)
             trans = read_npz_member(archive, path, "trans", pickled=True)
     except zipfile.BadZipFile:
         raise DataError(f"{path}: not a .npz file, perhaps truncated") from None
@@ -73,10 +82,8 @@ def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise DataError(f"{path}: pc is {points.dtype} {points.shape}; expected floats (views, points, 3)")
     if not np.isfinite(points).all():
         raise DataError(f"{path}: pc holds NaN or infinity; expected finite coordinates")
-    if segm.shape != points.shape[:2] or segm.dtype.kind not in "iu":
+    if segm.shape != points.shape[:2]:
         raise DataError(f"{path}: segm is {segm.dtype} {segm.shape}; expected whole numbers {points.shape[:2]}")
-    if segm.min() < 1 or segm.max() > 1000:
-        raise DataError(f"{path}: segm holds ids from {segm.min()} to {segm.max()}; expected 1 to the number of parts")
     return points.astype(np.float32), (segm - 1).astype(np.int16), _poses(path, trans, len(points), int(segm.max()))
 
 
@@ -102,9 +109,7 @@ def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray
         raise DataError(
             f"{path}: trans[{key!r}] has shape {matrices.shape}; expected ({views}, 4, 4), one for each view"
         )
-    rotation = matrices[:, :3, :3]
-    error = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max()
-    if not error < _RIGID or (np.linalg.det(rotation) < 0).any():  # a NaN is an error, too
+    if not are_rigid(matrices).all():
         raise DataError(f"{path}: trans[{key!r}] is not a rigid motion; expected a rotation and a shift")
     return matrices
 
@@ -149,7 +154,6 @@ class MultiBodySync:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        counts = {split: sum(item.split == split for item in items) for split in SPLITS}
-        lines = [f"{counted(len(items), 'sample')} ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]
+        lines = [f"{counted(len(items), 'sample')} ({counts_of_splits(item.split for item in items)})"]
         left = sorted({path.stem for path in (self.raw / "data").glob("[!.]*.npz")} - {item.name for item in items})
         return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dpcli.errors import UsageError
 from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.seeds import PrepareStream, generator
+
+
+def counts_of_splits(splits: Iterable[str]) -> str:
+    """Returns how many train, validate and test, in words: "8 train, 2 test"."""
+    counts = Counter(splits)
+    return ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,9 @@ class SplitRule:
             if unknown:
                 found = ", ".join(sorted(known - {""})) or "none"
                 raise UsageError(f"--{option}-categories {', '.join(unknown)}: no such category; found: {found}")
-        by_category = {**dict.fromkeys(self.validation_categories, "validation")}
-        by_category.update(dict.fromkeys(self.test_categories, "test"))
+        by_category = dict.fromkeys(self.validation_categories, "validation") | dict.fromkeys(
+            self.test_categories, "test"
+        )
         splits = [by_category.get(category, "") for category in categories]
         rest = [index for index, split in enumerate(splits) if not split]
         fractions = self.fractions or ((1.0, 0.0, 0.0) if by_category else (0.8, 0.1, 0.1))

@@ -15,12 +15,12 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names, path_inside
+from dpcli.prepare.articulated.articulated_object import are_rigid
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 
 ROOMS = 5000
 _SPLITS = {"train": "train", "val": "validation", "test": "test"}
-_RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
 _CLOUD = re.compile(r"pc_(\d+)\.npy")
 
 
@@ -45,10 +45,7 @@ def read_array(path: Path, kind: str, shape: tuple[int | None, ...]) -> np.ndarr
 def read_poses(path: Path) -> np.ndarray:
     """Reads pose_%02d.npy as f64 (objects,4,4). Raises DataError unless every matrix is a rotation and a shift."""
     pose = read_array(path, "f", (None, 4, 4)).astype(np.float64)
-    rotation = pose[:, :3, :3]
-    good = np.isfinite(pose).all((1, 2)) & (np.abs(pose[:, 3] - [0, 0, 0, 1]).max(1) < _RIGID)
-    good &= np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2)) < _RIGID
-    good[good] = np.linalg.det(rotation[good]) > 0
+    good = are_rigid(pose)
     if not good.all():
         raise DataError(
             f"{path}: the matrix of object {int(np.argmin(good)) + 1} is not a rigid motion; "

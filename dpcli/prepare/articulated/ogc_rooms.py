@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_object import triangle_areas
-from dpcli.prepare.articulated.object_splits import SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
 from dpcli.prepare.articulated.ogc_meshes import Shape, find_meshes, load_shape
 from dpcli.prepare.meshes.raycast import pixel_rays
@@ -23,7 +23,7 @@ from dpcli.prepare.meshes.surface_points import (
     points_on,
     raycasting_scene,
 )
-from dpcli.prepare.reader import SPLITS, Item, Sample, describe
+from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.store import CloudSequence
 
 POINTS = 2048
@@ -139,8 +139,7 @@ class GeneratedRooms:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        counts = Counter(item.split for item in items)
-        shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
+        shares = counts_of_splits(item.split for item in items)
         kinds = ",".join(map(str, self.options.objects))
         return [f"{len(items)} rooms of {kinds} objects ({shares}) from {len(find_meshes(self.meshes))} meshes"]
 

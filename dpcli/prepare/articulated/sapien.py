@@ -14,11 +14,11 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.decode.folder_listing import walk_folders
-from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
+from dpcli.prepare.reader import Item, Sample, describe, natural_key
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
@@ -164,8 +164,7 @@ class Sapien:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         good = {item.path: item.split for item in items if not item.problem}
-        counts = Counter(good.values())
-        shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
+        shares = counts_of_splits(good.values())
         names = f" of {counted(len(self.class_names), 'category', 'categories')}" if self.class_names else ""
         return (
             [f"{counted(len(good), 'object')}{names} ({shares}), {counted(self.pairs_per_object, 'sequence')} of each"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,10 +13,10 @@ from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.procedural.kinds import KINDS
 from dpcli.prepare.articulated.procedural.solids import Builder
-from dpcli.prepare.reader import SPLITS, Item, Sample, describe
+from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.runtime.seeds import PrepareStream, generator
 
 
@@ -97,8 +96,7 @@ class SyntheticArticulated:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        counts = Counter({item.extra["object"]: item.split for item in items}.values())
-        shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
+        shares = counts_of_splits({item.extra["object"]: item.split for item in items}.values())
         kinds = min(self.objects, len(self.class_names))  # they take turns
         return [
             f"{counted(self.objects, 'object')} of {counted(kinds, 'kind')} ({shares}), {counted(len(items), 'sequence')}"

@@ -46,9 +46,13 @@ def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads a MATLAB or HDF5 file of one cloud as `read_npz` reads its arrays."""
     with open_arrays(path) as arrays:
         plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
-    return _cloud_of_arrays(
-        path, {name: one.reshape(-1) if 1 in one.shape else one for name, one in plain.items()}, keep
-    )
+    return _cloud_of_arrays(path, {name: _as_vector(name, one) for name, one in plain.items()}, keep)
+
+
+def _as_vector(name: str, array: np.ndarray) -> np.ndarray:
+    """Returns a single row or column as the vector (N) that it is in MATLAB; that of points or colors is one point's."""
+    one_point = name in _POINT_KEYS or (name in _COLOR_KEYS and array.shape in ((1, 3), (1, 4)))
+    return array.reshape(-1) if array.ndim == 2 and 1 in array.shape and not one_point else array
 
 
 def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[str]) -> Cloud:
@@ -72,9 +76,6 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
     shapes = ((rows,), (rows, 1))  # the second as Open3D writes attributes
     columns = {name: one.reshape(-1) for name, one in arrays.items() if one.shape in shapes}
     _refuse_frames(path, columns)
-    missing = [name for name in keep if name not in columns]
-    if missing:
-        raise DataError(f"{path}: column {missing[0]}: no such array of one number a point")
     cloud.extra = kept_columns(path, columns, keep)
     cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud

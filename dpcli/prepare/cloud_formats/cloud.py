@@ -145,11 +145,16 @@ def as_points(columns: Sequence[np.ndarray]) -> np.ndarray:
     return np.array(columns, kind).T
 
 
+def require_names(path: Path, names: Sequence[str], keep: Sequence[str]) -> None:
+    """Raises DataError that lists a file's columns where one that was asked for is not among them."""
+    if missing := without(keep, names):
+        raise DataError(f"{path}: no column {missing[0]} among those to read; found {', '.join(names) or 'no names'}")
+
+
 def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str]) -> dict[str, np.ndarray]:
     """Returns the columns that were asked for, (N) as stored, by name. Raises DataError when one is missing or no numbers."""
+    require_names(path, list(columns), keep)
     for name in keep:
-        if name not in columns:
-            raise DataError(f"{path}: no column {name} among those to read; found {', '.join(columns) or 'no names'}")
         if columns[name].dtype.kind not in "fiub" or columns[name].ndim != 1:
             raise DataError(f"{path}: column {name} holds no numbers, one a point; ask for another, or none")
     return {name: columns[name] for name in keep}

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_points, without
+from dpcli.errors import DataError, reading
+from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_names, require_points, without
 from dpcli.prepare.cloud_formats.laz_chunks import check_chunks
 from dpcli.store.schema import METERS
 
@@ -37,16 +37,17 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the points, with colors as stored: 16 bits, some of which hold bytes. Raises DataError when damaged."""
     laspy = _load_laspy()
     room = _check_sizes(path)
-    try:
-        with laspy.open(path) as reader:
-            if reader.header.are_points_compressed and reader.header.point_count:
-                check_chunks(path, reader.header)
-            las = reader.read()
-    except (KeyboardInterrupt, SystemExit, DataError):
-        raise
-    except BaseException as error:  # LaspyException, struct.error, LazrsError...; a panic of lazrs is no Exception
-        kind = path.suffix[1:].upper()
-        raise DataError(f"{path}: not a readable {kind} file, perhaps truncated ({error})") from None
+    with reading(path):  # whose sentence is that of memory that ends
+        try:
+            with laspy.open(path) as reader:
+                if reader.header.are_points_compressed and reader.header.point_count:
+                    check_chunks(path, reader.header)
+                las = reader.read()
+        except (KeyboardInterrupt, SystemExit, MemoryError, DataError):
+            raise
+        except BaseException as error:  # LaspyException, struct.error, LazrsError...; a panic of lazrs is no Exception
+            kind = path.suffix[1:].upper()
+            raise DataError(f"{path}: not a readable {kind} file, perhaps truncated ({error})") from None
     if len(las.points) != las.header.point_count:
         raise DataError(f"{path}: truncated: its header says {las.header.point_count} points, found {len(las.points)}")
     _check_scales(path, las.header.scales)
@@ -54,7 +55,8 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     color = np.stack([np.asarray(las[name]) for name in _COLORS], axis=1) if set(_COLORS) <= set(names) else None
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
-    extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
+    require_names(path, names, keep)
+    extra = kept_columns(path, {name: np.asarray(las[name]) for name in keep}, keep)
     unread = without(names, "XYZ", _COLORS, _ABOUT_RETURNS, keep)
     unit, heights = _units(path, las)
     points = _scaled(las)

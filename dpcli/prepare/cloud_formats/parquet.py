@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, DpcError
+from dpcli.errors import DataError, DpcError, reading
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
 
@@ -28,29 +28,31 @@ class ParquetTable:
         except ImportError:
             raise DpcError('Parquet and Feather need pyarrow: pip install "dpc-toolkit[parquet]"') from None
         self.path = path
-        try:
-            if path.suffix.lower() != ".parquet":
-                self._table: Any = _read_feather(path)
-            else:
-                about = parquet.read_metadata(path)
-                require_room(path, _CELL * about.num_rows * about.num_columns)
-                self._table = parquet.read_table(path)
-        except DataError:
-            raise
-        except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
-            raise DataError(
-                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({' '.join(str(error).split())})"
-            ) from None
+        with reading(path):  # whose sentence is that of memory that ends
+            try:
+                if path.suffix.lower() != ".parquet":
+                    self._table: Any = _read_feather(path)
+                else:
+                    about = parquet.read_metadata(path)
+                    require_room(path, _CELL * about.num_rows * about.num_columns)
+                    self._table = parquet.read_table(path)
+            except (DataError, MemoryError):
+                raise
+            except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
+                kind, said = path.suffix[1:].capitalize(), " ".join(str(error).split())
+                raise DataError(f"{path}: not a readable {kind} table, perhaps truncated ({said})") from None
         self._table = self._table.flatten()  # a column of structures becomes one for each of their fields
         self.names = tuple(self._table.column_names)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
+        from pyarrow.types import is_temporal
+
         found = []
         for place in places:
             column = self._table.column(place)
             try:
-                if _parts_of_second(column.type):
+                if is_temporal(column.type):
                     raise ValueError("times are no numbers")
                 found.append(column.to_numpy().astype(np.float64))
             except (TypeError, ValueError):
@@ -83,7 +85,8 @@ class ParquetTable:
             return None
         kind = "int32" if column.type.bit_width == 32 else "int64"
         whole = column.cast(kind)
-        first = next((value for value in whole.to_pylist() if value is not None), 0)
+        known = whole.drop_null()
+        first = known[0].as_py() if len(known) else 0
         counted = (whole.fill_null(first).to_numpy() - first) / parts
         counted = past_midnight(counted) if types.is_time(column.type) else counted
         return np.where(column.is_valid().to_numpy(), counted, np.nan)

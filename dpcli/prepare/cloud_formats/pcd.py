@@ -55,7 +55,8 @@ def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
         columns = _read_compressed(path, body, header)
     shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
     posed = {POSED: 1} if header.posed else {}
-    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed, unit=header.unit)
+    cloud = cloud_of_columns(path, shown, keep)
+    return replace(cloud, dropped=beyond | posed, unit=cloud.unit or header.unit)
 
 
 def _read_header(path: Path, data: bytes) -> Header:
@@ -112,9 +113,9 @@ def _row_type(path: Path, said: dict[str, list[str]]) -> tuple[np.dtype, tuple[i
         raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT of its header have different lengths")
     row, taken = [], set()
     for place, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts)):
-        if kind.upper() not in _TYPES or not size.isdigit() or int(size) not in _TYPES[kind.upper()]:
+        if kind.upper() not in _TYPES or not size.isdecimal() or int(size) not in _TYPES[kind.upper()]:
             raise DataError(f"{path}: field {name} has TYPE {kind} SIZE {size}, which PCD doesn't know")
-        if not count.isdigit() or not 0 < int(count) < 65536:
+        if not count.isdecimal() or not 0 < int(count) < 65536:
             raise DataError(f"{path}: field {name} has COUNT {count}; expected 1 or more")
         for part in range(int(count)):
             own = name if int(count) == 1 and name != "_" else f"{name}_{place}_{part}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,18 @@ _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "long": "i8", "int64": "i8"},
     **{"ulong": "u8", "uint64": "u8", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_LENGTHS = {
+    "i1": "b",
+    "u1": "B",
+    "i2": "h",
+    "u2": "H",
+    "i4": "i",
+    "u4": "I",
+    "i8": "q",
+    "u8": "Q",
+    "f4": "f",
+    "f8": "d",
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _HEADER_BYTES = 1 << 20
@@ -43,10 +56,17 @@ class Element:
         """Returns whether its rows have no common length."""
         return any(not kind for _, kind in self.properties)
 
-    def list_types(self, name: str, order: str) -> tuple[np.dtype, np.dtype]:
-        """Returns the types of a list's length and of its numbers."""
-        length, numbers = self.lists.get(name, ("u1", "i4"))
-        return np.dtype(order + length), np.dtype(order + numbers)
+    def layout(self, order: str) -> list[tuple[struct.Struct | None, int, int]]:
+        """Returns of each property how a list's length lies in a file (None of a number), the bytes of a number, and how many a
+        list has at least.
+        """
+        parts: list[tuple[struct.Struct | None, int, int]] = []
+        for name, kind in self.properties:
+            length, numbers = self.lists.get(name, ("u1", "i4"))
+            corners = self.name == "face" and name.startswith("vertex_ind")  # range grids have empty lists
+            form = None if kind else struct.Struct(order + _LENGTHS[length])
+            parts.append((form, np.dtype(kind or numbers).itemsize, int(corners)))
+        return parts
 
 
 def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -70,7 +90,7 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
             return unpack_supersplat(path, chunks, rows, keep)
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
             cloud = cloud_of_columns(path, _read_with_lists(path, vertex), keep)
-            return replace(cloud, unread=cloud.unread + tuple(vertex.lists), unit=unit)
+            return replace(cloud, unread=cloud.unread + tuple(vertex.lists), unit=cloud.unit or unit)
         if order:
             columns, rest = _read_binary(path, file, order, vertex, before)
         else:
@@ -78,7 +98,8 @@ def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
         if order and behind:
             _require_elements(path, file, order, behind)
             rest = {}
-    return replace(cloud_of_columns(path, columns, keep), dropped=rest, unit=unit)
+    cloud = cloud_of_columns(path, columns, keep)
+    return replace(cloud, dropped=rest, unit=cloud.unit or unit)
 
 
 def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
@@ -95,7 +116,7 @@ def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
             order = _ORDERS.get(words[1])
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             elements.append(Element(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             elements[-1].properties.append((words[-1], _property_type(path, words)))
@@ -146,11 +167,11 @@ def _require_elements(path: Path, file: BinaryIO, order: str, elements: list[Ele
     start, data = file.tell(), memoryview(file.read())
     at = 0
     for element in elements:
-        rows = element.count
-        if rows and (size := _row_size(data, at, order, element)) and _are_alike(data[at:], size, rows, order, element):
+        rows, layout = element.count, element.layout(order)
+        if rows and (size := _row_size(data, at, layout)) and _are_alike(data[at:], size, rows, layout):
             at, rows = at + rows * size, 0
         while rows and at <= len(data):
-            at, rows = at + _row_size(data, at, order, element), rows - 1
+            at, rows = at + _row_size(data, at, layout), rows - 1
     if at > len(data) or len(data) - at > _LINE_END:
         raise DataError(
             f"{path}: {start + len(data)} bytes, but its header's counts take {start + at}{' or more' * (at > len(data))}:"
@@ -158,36 +179,34 @@ def _require_elements(path: Path, file: BinaryIO, order: str, elements: list[Ele
         )
 
 
-def _row_size(data: memoryview, start: int, order: str, element: Element) -> int:
+def _row_size(data: memoryview, start: int, layout: list[tuple[struct.Struct | None, int, int]]) -> int:
     """Returns the bytes of a row that begins at byte ``start``; more than there are where a list has no room or no corner."""
     at = start
-    for name, kind in element.properties:
-        if kind:
-            at += np.dtype(kind).itemsize
+    for length, size, least in layout:
+        if length is None:
+            at += size
             continue
-        length, numbers = element.list_types(name, order)
-        if at + length.itemsize > len(data):
+        if at + length.size > len(data):
             return len(data) + 1
-        count = int(np.frombuffer(data, length, 1, at)[0])
-        if count < (element.name == "face" and name.startswith("vertex_ind")):  # range grids have empty lists
+        count = int(length.unpack_from(data, at)[0])
+        if count < least:
             return len(data) + 1
-        at += length.itemsize + count * numbers.itemsize
+        at += length.size + count * size
     return at - start
 
 
-def _are_alike(data: memoryview, size: int, rows: int, order: str, element: Element) -> bool:
+def _are_alike(data: memoryview, size: int, rows: int, layout: list[tuple[struct.Struct | None, int, int]]) -> bool:
     """Returns whether all rows are as long as the first, ``size`` bytes, because their lists have as many numbers."""
     if rows * size > len(data):
-        return not element.has_lists
+        return all(length is None for length, _, _ in layout)
     table, at = np.frombuffer(data, np.uint8, rows * size).reshape(rows, size), 0
-    for name, kind in element.properties:
-        if kind:
-            at += np.dtype(kind).itemsize
+    for length, number, _ in layout:
+        if length is None:
+            at += number
             continue
-        length, numbers = element.list_types(name, order)
-        if (table[:, at : at + length.itemsize] != table[0, at : at + length.itemsize]).any():
+        if (table[:, at : at + length.size] != table[0, at : at + length.size]).any():
             return False
-        at += length.itemsize + int(np.frombuffer(data, length, 1, at)[0]) * numbers.itemsize
+        at += length.size + int(length.unpack_from(data, at)[0]) * number
     return True
 
 

@@ -13,6 +13,7 @@ from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 from dpcli.text_files import decode_text
 
 _HEADER = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)  # numbers in the lines before a scan: columns, rows, scanner, axes, matrix
+_MOST = 1e9  # columns or rows of a scan
 _NAMES = "x y z intensity red green blue".split()
 
 
@@ -22,6 +23,7 @@ def read_ptx(path: Path, keep: Sequence[str] = ()) -> Cloud:
     Raises DataError when a scan's header is none, or a scan holds fewer points than it says.
     """
     scans = list(_scans(path, [line for line in decode_text(path).split("\n") if line.strip()]))
+    scans = [scan for scan in scans if len(scan)] or scans[:1]  # one without points has no columns to compare
     if len({scan.shape[1] for scan in scans}) != 1:
         raise DataError(
             f"{path}: its scans have different columns; expected x y z intensity, and perhaps colors, in all"
@@ -38,7 +40,9 @@ def _scans(path: Path, lines: list[str]) -> Iterator[np.ndarray]:
     start = 0
     while start < len(lines) or not start:
         header = [_numbers(line) for line in lines[start : start + len(_HEADER)]]
-        if tuple(map(len, header)) != _HEADER or not all(one[0] == int(one[0]) >= 0 for one in header[:2]):
+        if tuple(map(len, header)) != _HEADER or not all(
+            0 <= one[0] < _MOST and one[0].is_integer() for one in header[:2]
+        ):
             raise DataError(
                 f"{path}: row {start + 1} begins no scan; expected its columns, rows, axes and a 4x4 matrix"
             )

@@ -17,6 +17,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     named_axes,
     refuse_times,
     require_columns,
+    require_names,
     unnamed_columns,
     without,
 )
@@ -131,8 +132,8 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     axes = named_axes(table.path, table.names)
     if axes is None:
         raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
-    places = [*axes[0], *find_colors(table.names), *(table.names.index(name) for name in keep if name in table.names)]
-    places = list(dict.fromkeys(places))
+    require_names(table.path, table.names, keep)
+    places = list(dict.fromkeys([*axes[0], *find_colors(table.names), *map(table.names.index, keep)]))
     values = table.columns(places)
     cloud = cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
     unread = without([name for name in table.names if name], cloud.columns, keep)

@@ -278,7 +278,7 @@ def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
     if not rows:
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
     if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
-        table = _without_count(table, *rows)
+        table = _without_count(table, *rows[0])
         rows = rows[1:] or rows
     table = _with_row_names(replace(table, delimiter=delimiter or delimiter_of(rows[0][1])), rows)
     return table if names else _checked_unnamed(_with_counted_header(table))
@@ -390,9 +390,10 @@ def delimiter_of(line: str) -> str | None:
     return None if decimal and not all(word.endswith(",") for word in words) else ","
 
 
-def _without_count(table: TextTable, counted: tuple[int, str], *_: tuple[int, str]) -> TextTable:
-    """Returns the table without a first row that counts the others. Raises DataError when it counts wrong."""
-    number, text = counted
+def _without_count(table: TextTable, number: int, text: str) -> TextTable:
+    """Returns the table without a first row ``text``, in line ``number``, that counts the others. Raises DataError when it
+    counts wrong.
+    """
     body = table.body.split("\n", number - table.first_line + 1)[-1]
     rest = replace(table, body=body, first_line=number + 1)
     found = len(rest.numbered) if "\n" in table.body else 0

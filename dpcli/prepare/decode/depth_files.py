@@ -442,7 +442,7 @@ def tells_times(path: Path) -> bool:
 
 
 def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
-    """Reads any depth video: a video file, an ``.npy``, or a folder of frames, of which ``series`` says which.
+    """Reads any depth video: a video file, a file of arrays, or a folder of frames, of which ``series`` says which.
 
     ``stride`` keeps every n-th frame. Raises DataError when it can't be read, or holds no frame.
     """
@@ -468,7 +468,8 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         except DataError as error:
             raise (stand_in(path) or error) from None
     else:
-        raise DataError(f"{path}: unknown kind; expected a folder of images, .npy, .npz or {', '.join(VIDEO_SUFFIXES)}")
+        kinds = ", ".join((*ARRAY_SUFFIXES, *VIDEO_SUFFIXES))
+        raise DataError(f"{path}: unknown kind; expected a folder of images, or one of {kinds}")
     if video.frames.size == 0:
         raise DataError(f"{path}: an empty video: shape {video.frames.shape}")
     return video
@@ -480,10 +481,9 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
         found = archived_depth(path)
         frames = depth_frames(path, found.depth)
         told = _told_beside(path, found, len(frames))
-        time = told["time"]
-        return DepthVideo(
-            np.ascontiguousarray(frames[::stride]), **{**told, "time": None if time is None else time[::stride]}
-        )
+        if told["time"] is not None:
+            told["time"] = told["time"][::stride]
+        return DepthVideo(np.ascontiguousarray(frames[::stride]), **told)
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
     from dpcli.prepare.decode.video_streams import how_shown

@@ -99,6 +99,19 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
     return np.asarray(image).reshape(header.height, header.width)
 
 
+def decode_picture(data: bytes, where: str | Path) -> np.ndarray | None:
+    """Decodes the bytes of a PNG, or of another picture that OpenCV knows, as they are stored; None where it can't.
+
+    Raises DataError where it is damaged in a way that OpenCV would fill in, as `check_picture` does.
+    """
+    image = decode_gray_png(data)
+    if image is None and data:
+        check_picture(data, where)
+        cv2 = load_cv2()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image
+
+
 def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple[int, ...] = (16,)) -> np.ndarray:
     """Decodes the bytes of a gray PNG to depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per
     pixel.
@@ -116,11 +129,7 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
     if header.color != 0 or header.bits not in bits:
         allowed, color = " or ".join(str(b) for b in bits), _COLOR.get(header.color, "unknown")
         raise DataError(f"{where}: {header.bits}-bit {color} PNG; expected {allowed}-bit gray depth")
-    image = decode_gray_png(data)
-    if image is None:
-        check_picture(data, where)
-        cv2 = load_cv2()
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decode_picture(data, where)
     if image is None or image.shape != (header.height, header.width):
         raise DataError(f"{where}: a damaged PNG; copy it again")
     return image

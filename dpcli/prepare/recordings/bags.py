@@ -19,7 +19,7 @@ class BagReader:
         from rosbags import rosbag1, rosbag2
         from rosbags.interfaces import MessageDefinitionFormat
 
-        ros1 = path.suffix == ".bag"
+        ros1 = path.is_file() and path.suffix == ".bag"  # a folder of ROS 2 may be called so, too
         self._bag: Any = (rosbag1 if ros1 else rosbag2).Reader(path)
         self._bag.open()
         self._connections = {one.id: one for one in self._bag.connections}

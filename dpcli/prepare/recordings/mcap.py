@@ -81,7 +81,7 @@ def _named(file: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not file:
+        if not file or isinstance(error, MemoryError):
             raise
         raise ValueError(f"{file}: {error}") from None
 

@@ -15,9 +15,8 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import BEYOND, Cloud, cloud_of_columns
 from dpcli.prepare.decode.calibration import lens_coefficients
-from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
-from dpcli.prepare.decode.png import check_picture, decode_gray_png
+from dpcli.prepare.decode.png import decode_picture
 from dpcli.prepare.recordings import foxglove
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, LivoxScan
 from dpcli.prepare.recordings.rvl import unpack_rvl
@@ -136,11 +135,7 @@ def _compressed_depth(path: Path, form: str, data: bytes) -> np.ndarray:
 
 
 def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
-    image = decode_gray_png(data)
-    if image is None:
-        check_picture(data, path)
-        cv2 = load_cv2()
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    image = decode_picture(data, path)
     if image is None:
         raise DataError(f"{path}: a compressed image ({form!r}) can't be decoded; it is damaged or of another kind")
     if image.ndim != 2 or data.startswith(_JPEG):

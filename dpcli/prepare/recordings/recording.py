@@ -136,7 +136,7 @@ class Recording:
         told = [f"{name} ({kind}{'' if count else ', no messages'})" for name, (kind, count) in self.topics.items()]
         held = first_names(told, _LISTED)
         said = f"no topic holds {what}; it has {held or 'no messages'}"
-        tool = _REPAIR_TOOLS.get(self.path.suffix.lower())
+        tool = _repair_tool(self.path)
         return f"{said}; if its index is not whole, {tool} makes it" if tool and not held else said
 
     def messages(self, topic: str, decode: Callable[[Message], Decoded], stride: int = 1) -> Iterator[Decoded]:
@@ -185,6 +185,12 @@ def _plain_mcap(folder: Path) -> list[Path]:
     unlisted = _unlisted(folder)
     listed = [one for one in folder.iterdir() if one.name.lower().endswith(_IN_FOLDERS) and one.name not in unlisted]
     return sorted(listed) if all(one.suffix == ".mcap" for one in listed) else []
+
+
+def _repair_tool(path: Path) -> str | None:
+    """Returns the program that repairs recordings of this kind, None where there is none."""
+    kind = path.suffix.lower() if not path.is_dir() else ".mcap" if _plain_mcap(path) else ""
+    return _REPAIR_TOOLS.get(kind)
 
 
 def _declared(folder: Path) -> dict[str, tuple[str, int]]:
@@ -262,7 +268,7 @@ def _damage_named(path: Path, topic: str = "") -> Iterator[None]:
         ) from None
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
-        tool = _REPAIR_TOOLS.get(".mcap" if _plain_mcap(path) else path.suffix.lower())
+        tool = _repair_tool(path)
         hint = f"; if it was cut off or lacks its index, {tool} repairs it" if tool else ""
         expected = "expected a ROS 1 bag, a ROS 2 bag, or an MCAP file"
         if topic:

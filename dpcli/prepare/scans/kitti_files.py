@@ -10,8 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.png import check_picture, decode_gray_png
+from dpcli.prepare.decode.png import decode_picture
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.series import is_hidden
 
@@ -125,11 +124,7 @@ def read_png(
 
     Raises DataError unless type and ``size`` (H,W) agree.
     """
-    data = path.read_bytes()
-    image = decode_gray_png(data)
-    if image is None and data:
-        check_picture(data, path)
-        image = load_cv2().imdecode(np.frombuffer(data, np.uint8), load_cv2().IMREAD_UNCHANGED)
+    image = decode_picture(path.read_bytes(), path)
     if image is None:
         raise DataError(f"{path}: not a readable PNG (empty or truncated); copy it again")
     if image.dtype.itemsize * 8 not in bits or (image.shape[2] if image.ndim == 3 else 1) != channels:

@@ -302,6 +302,15 @@ def first_hit(origin, direction, triangles):
     return t[hit].min() if hit.any() else np.inf
 
 
+def test_a_part_that_no_frame_shows_is_told():
+    b = Builder()
+    b.add(0, box((1, 1, 1)))
+    b.slide((0, 0, 0), Z, -0.2, 0.2, box((0.3, 0.3, 0.3)))
+    options = Articulation(view="single", points_per_frame=64)
+    sample = draw_sequence("s", study(b.build("hidden"), options), options, 2, generator(0))
+    assert not sample.sequence.part.any() and sample.notes == {"frames in which not every part is seen": 4}
+
+
 def test_single_view_takes_what_the_camera_sees():
     obj = build_object(0, KIND_NAMES.index("lamp"), KIND_NAMES)
     poses = obj.poses(np.zeros((1, len(obj.joints))))[0]

@@ -16,6 +16,8 @@ from dpcli.prepare.articulated.mbs import MultiBodySync, read_views
 from dpcli.store import CloudsReader
 from tests.support.commands import told as dpc
 
+FAR = np.array([[1, 0, 0, np.inf], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # shifts without end
+
 
 def motion(rng):
     matrix = np.eye(4)
@@ -72,7 +74,7 @@ def test_flow_is_the_published_formula(tmp_path):
 def test_the_command(tmp_path):
     samples = {0: make_sample(0, 2)[0], 1: make_sample(1, 5)[0], 12: make_sample(2, 3)[0]}
     raw = write(tmp_path / "raw", samples, {"train": [0, 3], "val": [12], "test": [1]})
-    done = dpc("prepare", "mbs", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    done = dpc("prepare", "mbs", raw, "-o", tmp_path / "x.h5", "--item-seconds", 0, "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert "000003.npz: listed under 'train' in meta.json, but not there" in done.stderr
     with CloudsReader(tmp_path / "x.h5") as reader:
@@ -144,6 +146,9 @@ def test_pickles_that_call_functions_are_refused(name, tmp_path):
         ({"pc": np.zeros((4, 5))}, r"pc is float64 \(4, 5\); expected floats \(views, points, 3\)"),
         ({"pc": np.full((4, 40, 3), np.nan)}, "pc holds NaN"),
         ({"segm": np.zeros((4, 40), int)}, "segm holds ids from 0 to 0; expected 1"),
+        ({"segm": np.zeros((4, 0), int)}, r"segm is int64 \(4, 0\); expected whole numbers"),
+        ({"segm": np.full((4, 40), np.nan)}, r"segm is float64 \(4, 40\); expected whole numbers"),
+        ({"segm": np.full((4, 40), 10**9)}, "segm holds ids from 1000000000 to"),
         ({"segm": np.ones((4, 39), int)}, r"segm is int64 \(4, 39\); expected whole numbers \(4, 40\)"),
         ({"segm": np.full((4, 40), 9)}, "trans has no 4; found 'cam', 1, 2, 3"),
         ({"trans": {1: []}}, "trans has no 'cam'"),
@@ -151,13 +156,17 @@ def test_pickles_that_call_functions_are_refused(name, tmp_path):
         ({"trans": {"cam": [np.eye(4)] * 3, 1: [], 2: [], 3: []}}, r"trans\['cam'\] has shape \(3, 4, 4\)"),
         ({"trans": {"cam": [2 * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, r"trans\['cam'\] is not a rigid motion"),
         ({"trans": {"cam": [np.nan * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, "is not a rigid motion"),
+        ({"trans": {"cam": [FAR] * 4, 1: [], 2: [], 3: []}}, "is not a rigid motion"),
+        ({"trans": {"cam": [np.diag([1.0, 1, 1, 2])] * 4, 1: [], 2: [], 3: []}}, "is not a rigid motion"),
     ],
 )
 def test_damaged_samples(change, words, tmp_path):
+    """They are refused, and the other samples keep the number of parts that they have."""
     sample, _ = make_sample(0)
-    raw = write(tmp_path / "raw", {0: {**sample, **change}}, {"train": [0]})
+    raw = write(tmp_path / "raw", {0: {**sample, **change}, 1: make_sample(1, 2)[0]}, {"train": [0, 1]})
     with pytest.raises(DataError, match=words):
         read_views(raw / "data" / "000000.npz")
+    assert {item.extra["parts"] for item in MultiBodySync(raw).items()} <= {2, 3, 9}
 
 
 def test_missing_arrays_and_files(tmp_path):

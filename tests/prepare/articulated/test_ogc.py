@@ -57,7 +57,7 @@ def test_released_rooms(tmp_path):
     other, _ = make_room(1, 5)
     rooms = {"3_000001": one, "5_000000": other}
     raw = write_raw(tmp_path / "räume 1", rooms, train=["3_000001"], val=["5_000000"], test=["8_000009"])
-    done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--item-seconds", 0, "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert "8_000009: in the list of the test split, but no such folder" in done.stderr
     with CloudsReader(tmp_path / "x.h5") as reader:
@@ -299,7 +299,7 @@ def hidden(eye, points, triangles):
 def test_generate_command(meshes, tmp_path):
     (meshes / "class 0" / "broken.obj").write_text("no mesh at all\n")
     words = ["--generate", meshes, "--rooms", 2, "--objects", "3,2", "--frames", 2, "--points", 64, "--seed", 3]
-    done = dpc("prepare", "ogc-dr", *words, "-o", tmp_path / "x.h5", "--jobs", 2)
+    done = dpc("prepare", "ogc-dr", *words, "-o", tmp_path / "x.h5", "--item-seconds", 0, "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert "another mesh drawn, for class 0/broken.obj cannot be used" in done.stderr
     again = GeneratedRooms(meshes, RoomOptions((3, 2), 2, 2, points=64), seed=3)

@@ -297,6 +297,8 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
         99,
         "--jobs",
         1,
+        "--item-seconds",
+        0,
         "--test-categories",
         "Good",
     )
@@ -322,6 +324,8 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
         98,
         "--jobs",
         1,
+        "--item-seconds",
+        0,
         "--test-categories",
         "Good",
     )
@@ -366,7 +370,7 @@ def test_collada_is_read_in_meters_whatever_unit_it_declares(meter, name):
 
 def test_what_is_odd_in_an_object_counts_once_not_once_a_sequence(tmp_path):
     two(tmp_path, link("c", box(1, 1, 1)), joint("k", "a", "c", kind="planar"))
-    few = ("--sequences-per-object", 3, "--frames", 2, "--points", 32)
+    few = ("--sequences-per-object", 3, "--frames", 2, "--points", 32, "--item-seconds", 0, "--jobs", 1)
     done = dpc("prepare", "sapien", tmp_path / "r.urdf", "-o", tmp_path / "o.h5", *few)
     assert "3 sequences" in done.stdout and "planar joints taken as fixed: 1\n" in done.stderr
 

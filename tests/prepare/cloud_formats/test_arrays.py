@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -66,6 +67,18 @@ def test_archives_whose_points_are_called_otherwise(tmp_path, arrays):
     np.testing.assert_array_equal(cloud.points, points)
     assert (cloud.color is not None) == ("rgb" in arrays)
     assert cloud.unread == tuple(name for name in arrays if name in ("snr", "normals", "label"))
+
+
+@pytest.mark.parametrize("shape", [(20, 3), (1, 20, 3), (1, 3)])
+def test_a_batch_of_one_and_a_single_point_of_hdf5_are_clouds(tmp_path, shape):
+    points = np.random.default_rng(0).uniform(0, 2, shape).astype(np.float32)
+    colors = np.arange(points.size, dtype=np.uint8).reshape(-1, 3)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"], file["colors"], file["v"] = points, colors, np.arange(len(colors))[None]
+    cloud = read_cloud(tmp_path / "a.h5", keep=["v"])
+    np.testing.assert_array_equal(cloud.points, points.reshape(-1, 3))
+    np.testing.assert_array_equal(cloud.color, colors)
+    assert cloud.extra["v"].tolist() == list(range(len(colors)))
 
 
 def test_columns_of_other_shapes_are_read_or_named(tmp_path):

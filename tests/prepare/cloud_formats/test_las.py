@@ -52,6 +52,22 @@ def test_what_laspy_writes_is_read_back(tmp_path, data):
         np.testing.assert_array_equal(cloud.color, color)
 
 
+def test_a_file_too_large_for_the_memory_is_not_called_truncated(tmp_path, monkeypatch):
+    def end_of_memory(_reader):
+        raise MemoryError
+
+    make(0, np.ones((2, 3))).write(str(tmp_path / "a.las"))
+    monkeypatch.setattr(laspy.LasReader, "read", end_of_memory)
+    with pytest.raises(DataError, match="a.las: too large for the memory there is, or damaged"):
+        read_las(tmp_path / "a.las")
+
+
+def test_a_column_to_keep_that_is_not_there_is_told_with_those_that_are(tmp_path):
+    make(0, np.ones((2, 3))).write(str(tmp_path / "a.las"))
+    with pytest.raises(DataError, match="no column snr among those to read; found X, Y, Z, intensity, return_number"):
+        read_las(tmp_path / "a.las", keep=["snr"])
+
+
 @pytest.mark.parametrize("factor", [1, 257])
 def test_bytes_and_words_of_color(tmp_path, factor):
     """A dark frame (all below 256) beside a bright one of 16 bits is dark, not bright."""

@@ -100,13 +100,15 @@ def test_a_color_of_a_text_that_is_no_number_is_none(tmp_path):
         (header() + "1,5 2,5 3\n1 2 word\n", ":12: column 'z' holds 'word'"),
         (header(size="4 4") + "1 2 3\n", "have different lengths"),
         (header(size="4 4 3") + "1 2 3\n", "field z has TYPE F SIZE 3"),
+        (header(size="4 4 ²") + "1 2 3\n", "field z has TYPE F SIZE "),
+        (header(count="1 1 ²") + "1 2 3\n", "field z has COUNT "),
         (header(data="zip") + "1 2 3\n", "DATA zip; expected ascii"),
         (header(data="binary_compressed") + "12345678", "truncated or damaged"),
         ("# .PCD\n", "no number of points in its header"),
     ],
 )
 def test_what_is_damaged_is_named(tmp_path, content, message):
-    (tmp_path / "a.pcd").write_text(content)
+    (tmp_path / "a.pcd").write_text(content, "latin-1")
     with pytest.raises(DataError, match=message):
         read_pcd(tmp_path / "a.pcd")
 
@@ -115,6 +117,16 @@ def test_several_blanks_decimal_commas_and_an_old_version(tmp_path):
     (tmp_path / "a.pcd").write_text(header(version=".5") + "1,5  2   3\n4 5,25 nan \n")
     points = read_pcd(tmp_path / "a.pcd").points
     np.testing.assert_array_equal(points, [[1.5, 2, 3], [4, 5.25, np.nan]])
+
+
+def test_units_in_names_count_before_those_in_comments(tmp_path):
+    for names, said, unit in (
+        ("x_mm y_mm z_mm", "", "mm"),
+        ("x_mm y_mm z_mm", "# unit: m\n", "mm"),
+        ("x y z", "# unit: m\n", "m"),
+    ):
+        (tmp_path / "a.pcd").write_text(said + header(names) + "1 2 3\n4 5 6\n")
+        assert read_pcd(tmp_path / "a.pcd").unit == unit
 
 
 def test_numbers_of_a_compressed_field_lie_point_after_point(tmp_path):

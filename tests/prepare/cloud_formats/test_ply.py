@@ -29,6 +29,18 @@ def read_text(path, *arguments, **options):
     return read_ply(path)
 
 
+@pytest.mark.parametrize("more", ["", "|list uchar int rings"])
+def test_units_in_names_are_read(tmp_path, more):
+    lines = text_ply(["1 2 3"], "float x_mm|float y_mm|float z_mm" + more)
+    if more:  # whose rows are read one by one, of bytes alone
+        head = lines.replace("ascii", "binary_little_endian").partition("1 2 3")[0].encode()
+        (tmp_path / "a.ply").write_bytes(head + np.float32([1, 2, 3]).tobytes() + b"\1" + np.int32([7]).tobytes())
+    else:
+        (tmp_path / "a.ply").write_text(lines)
+    cloud = read_ply(tmp_path / "a.ply")
+    assert cloud.points.tolist() == [[1, 2, 3]] and cloud.unit == "mm"
+
+
 def test_a_range_grid_of_empty_lists_is_no_damage(tmp_path):
     grid = np.array([([0],), ([],), ([1],)], dtype=[("vertex_indices", object)])
     points = np.array(POINTS, dtype=[(name, "f4") for name in "xyz"])
@@ -119,6 +131,12 @@ def test_lists_of_vertices_are_named(tmp_path):
     cloud = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
     assert cloud.unread == ("tags",)
+
+
+def test_a_count_that_is_no_number_is_named(tmp_path):
+    (tmp_path / "a.ply").write_text(text_ply(["1 2 3"]).replace("vertex 1", "vertex ²"), "latin-1")
+    with pytest.raises(DataError, match="no element vertex in its header"):
+        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("ends", [" \n", "\t\n", "  \r\n"])

@@ -198,7 +198,8 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
         head = ["3", "2", *(" ".join(map(str, row)) for row in [[0, 0, 0], *np.eye(3).tolist(), *matrix.tolist()])]
         scans += [*head, *(" ".join(map(str, [*point.tolist(), 0.5, *(color or [])])) for point in own)]
         expected.append(np.delete(own, 2, 0) @ turn + matrix[3, :3])
-    (tmp_path / "a.ptx").write_text("\r\n".join(scans) + "\r\n")
+    empty = ["0", "0", *scans[2:10]]
+    (tmp_path / "a.ptx").write_text("\r\n".join([*empty, *scans, *empty]) + "\r\n")
     cloud = read_cloud(tmp_path / "a.ptx", keep=["intensity"])
     np.testing.assert_allclose(cloud.points, np.concatenate(expected), atol=1e-9)
     assert cloud.dropped == {AT_ORIGIN: 2} and cloud.extra["intensity"].tolist() == [0.5] * 10
@@ -206,9 +207,17 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
     (tmp_path / "a.ptx").write_text("\n".join(scans[:-1]))
     with pytest.raises(DataError, match="says 6 points, it has room for 5"):
         read_cloud(tmp_path / "a.ptx")
-    (tmp_path / "a.ptx").write_text("\n".join(scans[1:]))
-    with pytest.raises(DataError, match="row 1 begins no scan"):
-        read_cloud(tmp_path / "a.ptx")
+    for lines in (
+        scans[1:],
+        ["nan", *scans[1:]],
+        ["inf", *scans[1:]],
+        ["1e200", "1e200", *scans[2:]],
+        ["2.5", *scans[1:]],
+        ["-3", *scans[1:]],
+    ):
+        (tmp_path / "a.ptx").write_text("\n".join(lines))
+        with pytest.raises(DataError, match="row 1 begins no scan"):
+            read_cloud(tmp_path / "a.ptx")
 
 
 def test_a_ptx_written_by_its_description_gives_the_places_in_the_world(tmp_path):
@@ -251,6 +260,11 @@ def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_pat
 def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
     cloud = read(tmp_path / f"a.{suffix}", text, keep=["snr"] if "snr" in text else [])
     assert cloud.points.shape == (0, 3) and (cloud.color is not None) == ("r,g,b" in text)
+
+
+def test_a_column_to_keep_that_is_not_there_is_told_with_those_that_are(tmp_path):
+    with pytest.raises(DataError, match="no column snr among those to read; found x, y, z, SNR, t"):
+        read(tmp_path / "a.csv", "x,y,z,SNR,t\n1,2,3,4,5\n", keep=["snr"])
 
 
 def test_kept_columns_that_float32_would_round_are_refused(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -27,6 +29,9 @@ def messages(kind: str, package: str = "livox_ros_driver") -> Messages:
     make.store.register(get_types_from_msg(POINT, f"{package}/msg/CustomPoint"))
     make.store.register(get_types_from_msg(SCAN, f"{package}/msg/CustomMsg"))
     return make
+
+
+messages_once = cache(messages)  # registering the types takes longest
 
 
 def scan(make: Messages, points: np.ndarray, stamp: int, place: str = "livox", package: str = "livox_ros_driver"):
@@ -65,7 +70,7 @@ def test_scans_of_livox_are_clouds_with_their_times(tmp_path, kind, package):
 @given(count=st.integers(0, 9), place=st.text("abc_/", max_size=12), kind=st.sampled_from(["bag", "mcap"]))
 @settings(max_examples=60, deadline=None)
 def test_the_name_of_the_sensor_moves_no_byte(count, place, kind):
-    make = messages(kind)
+    make = messages_once(kind)
     points = np.random.default_rng(count).uniform(-9, 9, (count, 3)).astype(np.float32)
     serialize = make.store.serialize_ros1 if make.ros1 else make.store.serialize_cdr
     raw = bytes(serialize(scan(make, points, START + 7, place), "livox_ros_driver/msg/CustomMsg"))

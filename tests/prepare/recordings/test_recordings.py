@@ -124,6 +124,16 @@ def test_headers_whose_time_passes_at_another_pace_are_doubted(tmp_path, scale, 
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3"])
+def test_a_folder_of_ros_2_may_be_called_as_a_file_is(tmp_path, kind, name):
+    make = Messages(kind)
+    path = write_recording(tmp_path / "run", kind, make, scans(make, [0, 1])).rename(tmp_path / name)
+    sequence = read(RecordedClouds(path)).sequence
+    np.testing.assert_array_equal(sequence.points, np.concatenate([rows(0), rows(1)]))
+    assert find_recordings(tmp_path) == [path]
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("packed", ["", "FILE"])
 def test_files_that_a_folder_of_ros_2_does_not_list_are_counted(tmp_path, kind, packed):
     make = Messages(kind)

@@ -7,6 +7,8 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
+from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.scans.frames_of_tables import ROUNDED
 from dpcli.prepare.scans.tables import TableSequences
 
@@ -158,6 +160,21 @@ def test_times_that_float32_rounded_are_told(tmp_path):
         csv(tmp_path / "a.csv", "time,x,y,z", [(moment, 1, 2, k) for k, moment in enumerate(moments)])
         reader = TableSequences(tmp_path / "a.csv", frame_column="time")
         assert (ROUNDED in reader.read(reader.items()[0], RNG).notes) == told
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_dates_tell_frames_apart_and_are_no_numbers(tmp_path, suffix):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import csv as texts
+    from pyarrow import parquet
+
+    days = pyarrow.array([18262, 18262, 18264], pyarrow.int32()).cast(pyarrow.date32())
+    table = pyarrow.table({"day": days, **{axis: [1.0, 2, 3] for axis in "xyz"}})
+    path = tmp_path / f"a.{suffix}"
+    (texts.write_csv if suffix == "csv" else parquet.write_table)(table, path)
+    assert np.diff(only_sequence(path, frame_column="day")[0].frame_offsets).tolist() == [2, 1]
+    with pytest.raises(DataError, match="column 'day' holds "):
+        read_cloud(path, keep=("day",))
 
 
 def test_numbers_of_frames_in_groups_of_thousands(tmp_path):

@@ -262,7 +262,7 @@ def window(b: Builder, rng: Rng) -> None:
 
 
 def cart(b: Builder, rng: Rng) -> None:
-    """Builds a tray on spoked wheels, steered in front, perhaps with a handle or a tipping tray."""
+    """Builds a tray, fixed or tipping, on spoked wheels, with a handle that swings."""
     w, d, r = rng.uniform(0.3, 0.6), rng.uniform(0.5, 1.0), rng.uniform(0.08, 0.18)
     b.add(0, box((w, d, 0.05)))
     tray = open_box((w, d, rng.uniform(0.15, 0.4)), 0.02, (0, 0, 0.0))
@@ -298,7 +298,7 @@ def bottle(b: Builder, rng: Rng) -> None:
 
 
 def bin_(b: Builder, rng: Rng) -> None:
-    """Builds a bin with a hinged lid, and a pedal that follows it or not."""
+    """Builds a bin with a hinged lid, perhaps with a pedal."""
     r, h = rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.8)
     b.add(0, lathe([(0, 0), (r * rng.uniform(0.7, 1), 0), (r, h)]))
     b.hinge((0, r, h), X, -rng.uniform(60, 110), 0, cylinder(r * 1.05, 0.03, (0, -r, 0.015)))

@@ -11,6 +11,7 @@ from dpcli.ops.rotations import axis_rotation
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, drop_degenerate
 
 X, Y, Z = np.eye(3)
+_SECTIONS = 24  # of what is turned about an axis
 
 
 def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
@@ -20,15 +21,13 @@ def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
     return corners[[t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]]
 
 
-def lathe(
-    profile: Sequence[tuple[float, float]], at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z, sections: int = 24
-) -> np.ndarray:
+def lathe(profile: Sequence[tuple[float, float]], at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z) -> np.ndarray:
     """Turns a profile of (radius, height) points about ``axis`` through ``at``: triangles f64 (T,3,3)."""
-    angle = np.linspace(0, 2 * np.pi, sections + 1)
+    angle = np.linspace(0, 2 * np.pi, _SECTIONS + 1)
     radius, height = np.array(profile, np.float64).T
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     grid = np.concatenate(
-        [radius[:, None, None] * ring, np.broadcast_to(height[:, None, None], (len(radius), sections + 1, 1))], axis=2
+        [radius[:, None, None] * ring, np.broadcast_to(height[:, None, None], (len(radius), _SECTIONS + 1, 1))], axis=2
     )
     a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
     faces = np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2)
@@ -59,7 +58,7 @@ def ring(radius: float, tube: float, at: Sequence[float] = (0, 0, 0), axis: np.n
     return lathe(list(zip(radius + tube * np.cos(angle), tube * np.sin(angle), strict=True)), at, axis)
 
 
-def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
+def plate(outline: Sequence[tuple[float, float]], thickness: float) -> np.ndarray:
     """Extrudes an outline (x,y), star-shaped about its mean, along z by ``thickness``, centered in z."""
     xy = np.array(outline, np.float64)
     after, middle, half = np.roll(xy, -1, axis=0), xy.mean(0), thickness / 2
@@ -75,7 +74,7 @@ def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence
         (low, next_low, lift(middle, -half)),
         (high, next_high, lift(middle, half)),
     ]
-    return np.concatenate([np.stack(face, axis=1) for face in faces]) + at
+    return np.concatenate([np.stack(face, axis=1) for face in faces])
 
 
 def open_box(size: Sequence[float], wall: float, at: Sequence[float] = (0, 0, 0), without: str = "top") -> np.ndarray:
