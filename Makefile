@@ -20,7 +20,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1
+.PHONY: help venv demo test bench fuzz kills soak lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1
 .PHONY: table-5.2 figure-5.3
 .PHONY: few-videos segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
@@ -48,7 +48,7 @@ help:
 	@echo "make fuzz [SEED=1 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
 	@echo "make soak [MINUTES=60]        a long stream, 60,000 samples, 256 shards: speed, memory and open files stay as they are"
 	@echo "make kills [KILLS=100]        kill -9 at random moments of ten commands: each must end as if nothing had happened"
-	@echo "make clean                    remove .venv, demo/ and caches"
+	@echo "make clean                    remove .venv, demo/, fuzz/, soak/ and caches; results in table/ and prior/ stay"
 	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
 
 venv: $(READY)
@@ -101,6 +101,7 @@ FLOW      ?= icp
 needs      = $(if $(strip $($(1))),,$(error make $@ needs $(1)=folder, $(2)))
 needs_either = $(if $(strip $(NVGESTURE)$(MSRACTION)),,$(error make $@ needs NVGESTURE=folder or MSRACTION=folder))
 MSR_IS    := the folder of MSRAction-3D's depth videos
+GLB_IS    := a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it
 NV_IS     := the folder of NvGesture's lists and Video_data
 EITHER     = $(if $(strip $(NVGESTURE)),nvgesture "$(NVGESTURE)",msraction3d "$(MSRACTION)")
 PLAN       = --preset $(PRESET) --seeds "$(SEEDS)" $(if $(CLIPS),--clips $(CLIPS)) $(if $(PREPARE),--prepare="$(PREPARE)")
@@ -156,7 +157,7 @@ T42_TRAIN ?= --validation 0.03 --epochs 6 --batch 4 --lr 0.0015 \
     --set motion_after=0.4 --set update_after=0.5 --set consensus_after=0.6
 
 table-4.2: $(READY)
-	$(if $(SAPIEN),,$(error make table-4.2 needs SAPIEN=folder, a folder of CATEGORY/ID/mobility.urdf))
+	$(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 	mkdir -p $(T42)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
@@ -170,16 +171,17 @@ table-4.2: $(READY)
 	for name in ours without-equivariance one-part dbscan ward ssc trajaffn; do for protocol in dpc release; do \
 	    echo "## $$name, protocol $$protocol"; \
 	    $(DPC) evaluate segmentation $(T42)/$$name.h5 --truth $(T42)/test.h5 --split test --protocol $$protocol --markdown || exit 1; \
-	done; done | tee $(T42)/table.md
+	done; done > $(T42)/table.md
+	cat $(T42)/table.md
 
 # Actions found in long recordings made of MSR-Action3D's test videos; SEGMENTS: words for the program.
 segments: $(READY)
-	$(if $(MSRACTION),,$(error make segments needs MSRACTION=folder, $(MSR_IS)))
+	$(call needs,MSRACTION,$(MSR_IS))
 	$(TABLES).segments "$(MSRACTION)" table/segments $(SEGMENTS)
 
 # Fine-tuning on classes never seen; FEW: words for the program, such as "--videos 5,10 -- --preset tiny --timing uniform".
 few-videos: $(READY)
-	$(if $(MSRACTION),,$(error make few-videos needs MSRACTION=folder, $(MSR_IS)))
+	$(call needs,MSRACTION,$(MSR_IS))
 	mkdir -p table/few-videos
 	$(DPC) prepare msraction3d "$(MSRACTION)" -o table/few-videos/clouds.h5 --points 1024
 	$(TABLES).few_videos table/few-videos/clouds.h5 table/few-videos $(FEW)
@@ -187,56 +189,56 @@ few-videos: $(READY)
 # Table 4.1: the switches of training, one after the other, with the same budget. Stopped, it goes on where it was.
 T41 := table/4.1
 table-4.1: $(READY)
-	$(if $(SAPIEN),,$(error make table-4.1 needs SAPIEN=folder, a folder of CATEGORY/ID/mobility.urdf))
+	$(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 	mkdir -p $(T41)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
-	$(BIN)/python -m dpcli.reproduce.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
+	$(TABLES).table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
 
 # Table 4.3 on new rooms of the models below MESHES, or on OGC-DR and OGC-DRSV in the folder OGC; T43: words for the program.
 OGC ?=
 table-4.3: $(READY)
 	$(if $(MESHES)$(OGC),,$(error make table-4.3 needs MESHES=folder, models to furnish rooms with, or OGC=folder, with OGC-DR and OGC-DRSV in it))
-	$(BIN)/python -m dpcli.reproduce.table_4_3 table/4.3 $(if $(OGC),--ogc "$(OGC)",--meshes "$(MESHES)") $(T43)
+	$(TABLES).table_4_3 table/4.3 $(if $(OGC),--ogc "$(OGC)",--meshes "$(MESHES)") $(T43)
 
 # Tables 4.4 to 4.6, objects of KITTI's streets; T44, T45, T46: words for the program. Stopped, they go on where they were.
 table-4.4: $(READY)
 	$(if $(KITTI_SF),,$(error make table-4.4 needs KITTI_SF=folder, with training/disp_occ_0, flow_occ, instance, ... in it))
-	$(BIN)/python -m dpcli.reproduce.street_tables table/4.4 --kitti-sf "$(KITTI_SF)" $(T44)
+	$(TABLES).street_tables table/4.4 --kitti-sf "$(KITTI_SF)" $(T44)
 
 table-4.5: $(READY)
 	$(if $(KITTI_DET),,$(error make table-4.5 needs KITTI_DET=folder, with training/velodyne, label_2, calib in it))
-	$(BIN)/python -m dpcli.reproduce.street_tables table/4.5 --kitti-det "$(KITTI_DET)" $(T45)
+	$(TABLES).street_tables table/4.5 --kitti-det "$(KITTI_DET)" $(T45)
 
 table-4.6: $(READY)
-	$(if $(SEMANTICKITTI),,$(error make table-4.6 needs SEMANTICKITTI=folder, with dataset/sequences/00 ... 10 in it))
-	$(BIN)/python -m dpcli.reproduce.street_tables table/4.6 --semantickitti "$(SEMANTICKITTI)" $(T46)
+	$(call needs,SEMANTICKITTI,with dataset/sequences/00 ... 10 in it)
+	$(TABLES).street_tables table/4.6 --semantickitti "$(SEMANTICKITTI)" $(T46)
 
 # Table 5.1 on ARTEMIS' animals (ARTEMIS names their folder) or on animated meshes; T51: words for the program.
 MESHES ?=
 ARTEMIS ?=
 table-5.1: $(READY)
 	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
-	$(BIN)/python -m dpcli.reproduce.scenes.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
+	$(TABLES).scenes.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files; T52: words for the program. Stopped, it
 # goes on where it was.
 table-5.2: $(READY)
-	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.scenes.table_5_2 "$(MESHES)" table/5.2 $(T52)
+	$(call needs,MESHES,$(GLB_IS))
+	$(TABLES).scenes.table_5_2 "$(MESHES)" table/5.2 $(T52)
 
 # Figure 5.3 of the thesis on the same clips: the number of control points, and the weight of temporal preservation.
 figure-5.3: $(READY)
-	$(if $(MESHES),,$(error make figure-5.3 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.scenes.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
+	$(call needs,MESHES,$(GLB_IS))
+	$(TABLES).scenes.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
 HELD_OUT := dpcli/reproduce/scenes/held_out_models.txt
 PRIOR ?= --set bfloat16=true
 prior: $(READY)
-	$(if $(MESHES),,$(error make prior needs MESHES=folder, a folder with the models of $(HELD_OUT) and many others below it))
+	$(call needs,MESHES,a folder with the models of $(HELD_OUT) and many others below it)
 	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
-	$(BIN)/python -m dpcli.reproduce.scenes.prior_sides "$(MESHES)" prior --models prior/run
+	$(TABLES).scenes.prior_sides "$(MESHES)" prior --models prior/run
 
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \
@@ -270,5 +272,5 @@ lint: $(READY)
 	$(BIN)/python -m ruff format --quiet --check . || { echo "make: some files are not formatted; ruff format . does it" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) demo table fuzz soak build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo fuzz soak build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -213,6 +213,14 @@ def test_the_goals_of_the_makefile_run_commands_that_exist(given, tmp_path):
     assert [name for name in modules if not module_exists(name)] == []
 
 
+def test_every_goal_of_the_makefile_runs_though_a_folder_has_its_name():
+    """Such as soak/ and demo/, which the goals themselves make."""
+    makefile = (ROOT / "Makefile").read_text()
+    goals = set(re.findall(r"^([a-z][\w.-]*(?: [a-z][\w.-]*)*):(?!=)", makefile, re.MULTILINE))
+    phony = set(" ".join(re.findall(r"^\.PHONY: (.*)", makefile, re.MULTILINE)).split())
+    assert {goal for line in goals for goal in line.split()} == phony
+
+
 # The page that tells where things are
 
 

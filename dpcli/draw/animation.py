@@ -160,7 +160,6 @@ def _even(picture: np.ndarray) -> np.ndarray:
 
 
 def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-
     whole = list(pictures)
     table = _color_table(np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1))
     images = [_numbered(picture, table) for picture in whole]

@@ -22,6 +22,7 @@ from dpcli.draw.sheet import save_figure
 from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, prepared
 from dpcli.reproduce.runs import (
     DASH,
+    Cell,
     Dpc,
     attempt,
     beside,
@@ -105,18 +106,18 @@ class Network:
         """Returns the folder of this backbone's networks."""
         return self.folder / self.backbone
 
-    def cell(self, name: str, clouds: Path, *words: str):
+    def cell(self, name: str, clouds: Path, *words: str) -> Cell:
         """Returns the cell of one network, trained on the clouds by more words."""
         setting = Setting(name, "", "", ("--set", f"backbone={self.backbone}", "--frames", "16", *words), "")
         cell = self.plan.cell(setting, self.seed, clouds, self.place)
         cell.scores = cell.folder / f"{name}.h5"
         return cell
 
-    def static(self):
+    def static(self) -> Cell:
         """Returns the cell of the static network."""
         return self.cell("static", self.clouds, "--set", "epochs_dynamic=0")
 
-    def kinet(self):
+    def kinet(self) -> Cell:
         """Returns the cell of Kinet, whose dynamic stream is trained on the static network."""
         return self.cell("kinet", self.clouds, "--epochs", "0", "--set", f"static_from={self.static().model}")
 
@@ -196,7 +197,7 @@ def picture(cost: Mapping[str, dict[str, Cost]], found: Found, path: Path) -> No
     axes = figure.add_subplot()
     for (backbone, kind), (flops, parameters, accuracy) in THESIS.items():
         style = {"marker": _MARKS[kind], "edgecolors": _COLORS[backbone]}
-        name = f"{KINDS[kind].format(BACKBONES[backbone])}"
+        name = KINDS[kind].format(BACKBONES[backbone])
         axes.scatter(flops, accuracy, s=_area(parameters), facecolors="none", **style)
         own = shares(found.get((backbone, kind), []), "static" if kind == "static" else "fused")
         if own:

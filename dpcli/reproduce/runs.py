@@ -14,7 +14,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
@@ -28,6 +29,8 @@ Dpc = Callable[..., str]
 STOPPED = (75, 130, 143)  # exit codes of a command that was asked to stop
 DASH = "–"
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP)
+_command = [sys.executable, "-m", "dpcli"]
+_running: set[subprocess.Popen] = set()
 
 
 def dpc(*words: object, threads: int | None = None) -> str:
@@ -36,21 +39,52 @@ def dpc(*words: object, threads: int | None = None) -> str:
     A signal to this program goes on to the command, which saves its work before it ends.
     """
     limits = {} if threads is None else {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    main = threading.current_thread() is threading.main_thread()
     process = subprocess.Popen(
-        [sys.executable, "-m", "dpcli", *map(str, words)],
+        [*_command, *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **limits},
-        start_new_session=main,
+        start_new_session=True,
     )
-    with answering(_FORWARDED, process.send_signal):
+    _running.add(process)
+    with answering(_FORWARDED, _forward):
         out, _ = process.communicate()
+    _running.discard(process)
     if process.returncode:
         code = process.returncode if process.returncode > 0 else 128 - process.returncode
         print(f"dpc {' '.join(map(str, words))}: exit {code}", file=sys.stderr)
         sys.exit(code)
     return out
+
+
+def _forward(number: int) -> None:
+    for process in tuple(_running):
+        process.send_signal(number)
+
+
+def side_by_side(work: Mapping[str, Sequence[Callable[[], dict]]], jobs: int) -> dict[str, list[dict]]:
+    """Returns what the calls of each row find, `jobs` of them at a time in threads.
+
+    A signal goes on to every command that runs. After it, or once a call ends the program, no other call begins.
+    """
+    ended = threading.Event()
+
+    def call(one: Callable[[], dict]) -> dict:
+        if ended.is_set():
+            sys.exit(STOPPED[0])
+        try:
+            return one()
+        except BaseException:
+            ended.set()
+            raise
+
+    def stop(number: int) -> None:
+        ended.set()
+        _forward(number)
+
+    with answering(_FORWARDED, stop), ThreadPoolExecutor(jobs) as pool:
+        running = {row: [pool.submit(call, one) for one in calls] for row, calls in work.items()}
+        return {row: [job.result() for job in own] for row, own in running.items()}
 
 
 def attempt(work: Callable[[], object], what: str) -> str:

@@ -15,13 +15,11 @@ import sys
 from pathlib import Path
 
 from dpcli.reproduce.runs import DASH, cut, dpc, refuse_unknown, thesis_rows, write_text
+from dpcli.reproduce.table_4_3 import METRICS
 
-METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 _BOTH = ("--set", "consensus=none", "--set", "motion_head=false")
 _PAST = ("--set", "flow_decay=1", *_BOTH)
 _CURRENT = ("--set", "flow_decay=0", *_BOTH)
-
-
 ROWS = {  # in the thesis's order: what is switched, and the words that do it
     "plain": ("no SE(3) features, past flow", ("--set", "group=trivial", *_PAST)),
     "global": ("SE(3), pooled per cloud, past flow", ("--set", "pooling=global", *_PAST)),

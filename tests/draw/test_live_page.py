@@ -13,16 +13,18 @@ from dpcli.classify.segments.recording import Cutting
 from dpcli.classify.stream.sliding_window import Prediction
 from tests.support.browser import needs_browser, open_page
 
+SURE, UNSURE = (0.9, 0.1), (0.5, 0.5)
 
-def write(path, frames: int = 40, names: tuple[str, ...] = ("wave </script>", "bow")) -> None:
-    how = Cutting(8, 2, 4, Confidence(1.0, 0.7))
+
+def write(path, frames: int = 40, names: tuple[str, ...] = ("wave </script>", "bow"), least=0.7, rows=(SURE, UNSURE)):
+    how = Cutting(8, 2, 4, Confidence(1.0, least))
     page, rng = LivePage(path, "stdin", names, how, "dpc classify predict -"), np.random.default_rng(0)
     for frame in range(frames):
         page.see(rng.normal(size=(0 if frame == 5 else 1 + frame % 40, 3)).astype(np.float32), 0.0)
         if frame >= 7 and frame % 2:
-            row = [0.9, 0.1] if frame < 20 else [0.5, 0.5]
-            page.write(Prediction(frame, 1, np.array([row], np.float32), np.array([row], np.float32)), 0.02, 0)
-    page.finish(np.array([[0.5, 0.5]]), frames, 10, "end of stream")
+            row = np.array([rows[int(frame >= 20)]], np.float32)
+            page.write(Prediction(frame, 1, row, row), 0.02, 0)
+    page.finish(np.array(rows[1:]), frames, 10, "end of stream")
 
 
 def drawn(address: str, folder: Path, *options: str) -> tuple[str, str]:
@@ -44,6 +46,14 @@ def test_the_page_tells_what_was_said_at_a_frame(tmp_path, frame, told):
     address = f"file://{tmp_path / 'live.html'}#frame={frame}&play=0&renderer=2d"
     html, said = drawn(address, tmp_path)
     assert told in said and 'id="error" class="card" role="alert" hidden' in html
+
+
+@needs_browser
+def test_the_page_names_the_best_class_though_others_are_near_to_it_and_to_the_threshold(tmp_path):
+    near = (0.3301, 0.3349, 0.3350)  # 84.2, 85.4 and 85.4 of 255; the threshold is 84.2 of it
+    write(tmp_path / "live.html", names=("wave", "bow", "run"), least=0.33, rows=(near, (0.3299, 0.3301, 0.33)))
+    for frame, told in ((12, "run 0.3"), (38, "bow 0.33")):
+        assert told in drawn(f"file://{tmp_path / 'live.html'}#frame={frame}&play=0&renderer=2d", tmp_path)[1]
 
 
 @needs_browser

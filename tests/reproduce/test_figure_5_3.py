@@ -48,8 +48,11 @@ def test_values_are_swept_and_done_once(asked, monkeypatch, tmp_path):
         and "| 512 | 21.000 | 0.900 | 0.500 | 3.000 | yes |" in text
     )
     assert (tmp_path / "out" / "figure.png").read_bytes().startswith(b"\x89PNG")
-    before = len(asked)
-    assert run(monkeypatch, figure_5_3, tmp_path, *words) == text and len(asked) == before
+    asked.clear()
+    assert run(monkeypatch, figure_5_3, tmp_path, *words) == text
+    assert [one[0] for one in asked] == ["prepare"]  # which passes over what is there
+    run(monkeypatch, figure_5_3, tmp_path, *words, "--steps", "20,30")
+    assert [one[:2] for one in asked].count(["generate4d", "fit"]) == 2 and "dense_steps=20" in str(asked)
 
 
 def test_a_sweep_of_nothing_is_said(monkeypatch, capsys):

@@ -27,10 +27,10 @@ def test_a_toy_table_is_made_once(tmp_path, monkeypatch, dpc_told, capfd):
     for kind, sides in enumerate([(1, 2, 0.6), (3, 1, 1), (0.5, 0.5, 2)]):
         (meshes / f"class{kind % 2}").mkdir(parents=True, exist_ok=True)
         trimesh.creation.box(np.array(sides)).export(meshes / f"class{kind % 2}" / f"box{kind}.obj")
-    words = [folder, "--meshes", meshes, "--rooms", 1, "--points", 128, "--methods", "dbscan,ssc"]
+    words = [folder, "--meshes", meshes, "--rooms", 1, "--points", 128, "--methods", "dbscan,ward"]
     main([str(word) for word in words])
     text = (folder / "table.md").read_text()
-    assert text in capfd.readouterr().out and text.count("| dbscan |") == text.count("| ssc |") == 2
+    assert text in capfd.readouterr().out and text.count("| dbscan |") == text.count("| ward |") == 2
     assert "## full" in text and "## single view" in text and "| *network, unsupervised, thesis* | 88.1 |" in text
     made = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
     main([str(word) for word in words])

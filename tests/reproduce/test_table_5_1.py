@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.reproduce import runs
 from dpcli.reproduce.scenes import table_5_1
 from dpcli.reproduce.scenes.table_5_1 import film_artemis, table
 from tests.support.gltf_files import GlbFile
@@ -52,10 +53,11 @@ class _OneAtATime:
 
 def test_a_toy_table_is_made_and_running_again_fits_nothing(tmp_path, monkeypatch, dpc_told, capfd) -> None:
     monkeypatch.setattr(table_5_1, "dpc", dpc_told)
-    monkeypatch.setattr(table_5_1, "ThreadPoolExecutor", _OneAtATime)
+    monkeypatch.setattr(runs, "ThreadPoolExecutor", _OneAtATime)
     _box(tmp_path / "meshes" / "boxes" / "Box.glb")
     words = ["table_5_1", str(tmp_path / "t"), "--meshes", str(tmp_path / "meshes"), "--clips", "boxes/Box.glb:0"]
     words += ["--size", "48", "--frames", "3", "--rows", "flat,prior", "--", "--preset", "tiny"]
+    words += ["--set", "dense_steps=4", "--set", "sparse_steps=4"]
     monkeypatch.setattr(sys, "argv", words)
     table_5_1.main()
     text = (tmp_path / "t" / "table.md").read_text()
@@ -78,5 +80,7 @@ def test_means_have_intervals_and_what_is_missing_is_a_dash() -> None:
 
 
 def test_a_folder_without_animals_is_said(tmp_path) -> None:
+    (tmp_path / "Bear").mkdir()
+    (tmp_path / "Bear" / "CamPose.inf").touch()  # whose pictures are not unpacked
     with pytest.raises(SystemExit, match="no ANIMAL/CamPose.inf"):
         film_artemis(tmp_path, tmp_path, 64, 4)

@@ -35,9 +35,9 @@ class LiveTrack:
 
 
 def live_page(facts: PageFacts, sequence: PageSequence, track: LiveTrack, class_names: Sequence[str]) -> str:
-    """Returns the page. sequence: the frames to show, x right, y up. Probabilities are rounded to 1/255."""
+    """Returns the page. sequence: the frames to show, x right, y up. Probabilities are rounded to 1/65535."""
     header, blocks = points_parts(facts, [sequence], axes=np.diag([1.0, -1.0, -1.0]), unit="")
-    table = np.rint(track.probabilities * 255).astype(np.uint8).tobytes()
+    table = np.rint(track.probabilities * 65535).astype("<u2").tobytes()
     header["live"] = {
         "bytes": len(table),
         "classes": [name or f"class {at}" for at, name in enumerate(class_names)],

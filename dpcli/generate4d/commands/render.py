@@ -111,8 +111,8 @@ def _render_path(
 
         def draw() -> Iterator[np.ndarray]:
             for picture in renderer.pictures(shots, look):
+                progress.advance()  # before it is given away: who takes one picture doesn't come back for a second
                 yield picture
-                progress.advance()
 
         write_pictures(output, draw(), settings.fps or default_rate(renderer.scene, path), force=force)
     width, height = (side + side % 2 if kind == ".mp4" else side for side in shots[0].size)  # as H.264 needs them

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
 from dpcli.errors import DpcError
 from dpcli.generate4d.priors.interface import RelativeCamera
@@ -23,6 +22,8 @@ from dpcli.runtime.progress import Progress, log
 
 _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _CHUNK = 8  # frames encoded at a time
+_GUIDANCE = 5.0  # of the classifier-free guidance
+_T_RANGE = 0.2, 0.8  # shares of the model's steps that are drawn
 
 
 def camera_scalars(
@@ -72,31 +73,12 @@ def sds_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
 class ScoreDistillation:
     """Implements `Prior` by score distillation sampling. The model is frozen; its conditioning is computed once for each frame.
 
-    guidance_scale: classifier-free guidance. timestep: "annealed" by progress, or "random", uniform in t_range, one per
-    view. t_range: shares of the model's steps; may be set anew between stages (SC4D: 0.6-0.8, then 0.2-0.8).
     reference_elevation: radians, read by Stable Zero123 only. image_size: pixels the model was trained at.
-    low_memory: views pass the encoder one by one and again in the backward pass, the two halves of the guidance one after
-    the other; slower, same loss up to rounding.
     """
 
-    def __init__(
-        self,
-        model: Zero123Model,
-        *,
-        guidance_scale: float = 5.0,
-        timestep: str = "annealed",
-        t_range: tuple[float, float] = (0.2, 0.8),
-        reference_elevation: float = 0.0,
-        image_size: int = 256,
-        low_memory: bool = False,
-    ) -> None:
-        if timestep not in ("annealed", "random"):
-            raise ValueError(f"timestep is 'annealed' or 'random', but is {timestep!r}")
-        if not 0 <= t_range[0] <= t_range[1] <= 1:
-            raise ValueError(f"t_range is two ascending shares in 0..1, but is {t_range}")
-        self.model, self.guidance_scale, self.timestep, self.t_range = model, guidance_scale, timestep, t_range
+    def __init__(self, model: Zero123Model, *, reference_elevation: float = 0.0, image_size: int = 256) -> None:
+        self.model, self.image_size = model, image_size
         self.reference_elevation = reference_elevation if model.stable else None
-        self.image_size, self.low_memory = image_size, low_memory
         self._embedding = self._reference = torch.empty(0)  # [T, E] and [T, 4, h, w]
 
     @classmethod
@@ -140,7 +122,7 @@ class ScoreDistillation:
         """
         self._check(renders, cameras, frames)
         latents = self._latents(renders)
-        timestep = self._timesteps(len(latents), progress, generator)
+        timestep = torch.full((len(latents),), annealed_timestep(progress, _T_RANGE, len(self.model.alphas_cumprod)))
         noise = torch.randn(latents.shape, generator=generator, device=generator.device).to(latents.device)
         with torch.no_grad():
             abar = self.model.alphas_cumprod[timestep].to(latents.device)[:, None, None, None]
@@ -161,21 +143,8 @@ class ScoreDistillation:
         images = self._resized(renders.to(self.model.device).float().permute(0, 3, 1, 2))
         if images.requires_grad:
             images.register_hook(_finite_views)  # the encoder's backward pass is in half precision, too
-        if not self.low_memory:
-            return self._encode(images)
-        return torch.cat([checkpoint(self._encode, image, use_reentrant=False) for image in images.split(1)])
-
-    def _encode(self, images: torch.Tensor) -> torch.Tensor:
         vae = self.model.vae
         return vae.encode((2 * images - 1).to(self.model.dtype)).latent_dist.mode().float() * vae.config.scaling_factor
-
-    def _timesteps(self, count: int, progress: float, generator: torch.Generator) -> torch.Tensor:
-        steps = len(self.model.alphas_cumprod)
-        latest = annealed_timestep(0.0, self.t_range, steps)
-        if self.timestep == "random":
-            earliest = annealed_timestep(1.0, self.t_range, steps)
-            return torch.randint(earliest, latest + 1, (count,), generator=generator, device=generator.device).cpu()
-        return torch.full((count,), annealed_timestep(progress, self.t_range, steps))
 
     def _noise_prediction(
         self, noisy: torch.Tensor, timestep: torch.Tensor, cameras: Sequence[RelativeCamera], frames: Sequence[int]
@@ -183,17 +152,14 @@ class ScoreDistillation:
         """Returns eps_hat f32 (B,4,h,w); without condition both the token and the reference's latent are zero."""
         token = self._tokens(cameras, frames)
         reference = self._reference[list(frames)]
-        arguments = (torch.cat([noisy, noisy]), torch.cat([timestep, timestep]).to(noisy.device))
-        conditions = (torch.cat([token, torch.zeros_like(token)]), torch.cat([reference, torch.zeros_like(reference)]))
-        size = len(noisy) if self.low_memory else 2 * len(noisy)
-        chunks = zip(*(whole.split(size) for whole in (*arguments, *conditions)), strict=True)
-        return guided_noise(*torch.cat([self._unet(*chunk) for chunk in chunks]).chunk(2), self.guidance_scale)
-
-    def _unet(
-        self, noisy: torch.Tensor, timestep: torch.Tensor, token: torch.Tensor, reference: torch.Tensor
-    ) -> torch.Tensor:
         stacked = torch.cat([noisy.to(self.model.dtype), reference], 1)
-        return self.model.unet(stacked, timestep, encoder_hidden_states=token).sample.float()
+        unknown = torch.cat([stacked[:, : noisy.shape[1]], torch.zeros_like(reference)], 1)
+        predicted = self.model.unet(
+            torch.cat([stacked, unknown]),
+            torch.cat([timestep, timestep]).to(noisy.device),
+            encoder_hidden_states=torch.cat([token, torch.zeros_like(token)]),
+        )
+        return guided_noise(*predicted.sample.float().chunk(2), _GUIDANCE)
 
     def _tokens(self, cameras: Sequence[RelativeCamera], frames: Sequence[int]) -> torch.Tensor:
         """Returns the conditioning tokens (B,1,cross-attention width)."""

@@ -24,8 +24,6 @@ class Motion:
     quaternion: Tensor  # [B, N, 4] unit, w >= 0, turns the point's own frame
     part: Tensor  # [B, N, S] probabilities (m)
     weight: Tensor  # [B, N, 1] share of the rigid motion (w), 0..1
-    part_quaternion: Tensor  # [B, S, 4]
-    part_translation: Tensor  # [B, S, 3]: x -> R_s x + t_s
 
 
 def encode(
@@ -138,19 +136,18 @@ class MotionField(nn.Module):
         hidden = self.deformation(code)
         rest, turn = self.deformation_shift(hidden), _quaternion(self.deformation_turn(hidden))
         part = self.part_of(points, times)
-        part_turn, part_shift = self.part_motion(times)
         if not self.rigid:
-            weight = torch.zeros(*rest.shape[:2], 1).to(rest)
-            return Motion(rest, turn, part, weight, part_turn, part_shift)
+            return Motion(rest, turn, part, torch.zeros_like(rest[..., :1]))
+        part_turn, part_shift = self.part_motion(times)
         moved = torch.einsum("bns,bsij,nj->bni", part, quaternion_to_matrix(part_turn), points) + part @ part_shift
         rigid, rigid_turn = moved - points, normalize_quaternion(part @ part_turn)
         if self.fusion:
             weight = self.weighing_head(self.weighing(code)).sigmoid()
             displacement, both = blend_motions(rigid, rigid_turn, rest, turn, weight)
         else:
-            weight = torch.ones(*rest.shape[:2], 1).to(rest)
+            weight = torch.ones_like(rest[..., :1])
             displacement, both = add_motions(rigid, rigid_turn, rest, turn)
-        return Motion(displacement, both, part, weight, part_turn, part_shift)
+        return Motion(displacement, both, part, weight)
 
 
 def blend_motions(

@@ -8,9 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dpcli.counted import counted
+from dpcli.draw.views_sheet import on_white
 from dpcli.errors import DataError
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsReader
@@ -36,15 +35,10 @@ def input_sheet(clip: Path, scene: GaussianScene) -> dict[str, Any]:
         columns = math.ceil(math.sqrt(scene.num_frames))
         sheet = Image.new("RGB", (columns * width, math.ceil(scene.num_frames / columns) * height), "white")
         for frame in range(scene.num_frames):
-            picture = Image.fromarray(_on_white(reader.rgba(reader.header.reference, frame)))
+            picture = Image.fromarray(on_white(reader.rgba(reader.header.reference, frame)))
             place = (frame % columns * width, frame // columns * height)
             sheet.paste(picture.resize((width, height), Image.Resampling.BOX), place)
     packed = io.BytesIO()
     sheet.save(packed, "JPEG", quality=_QUALITY)
     text = base64.b64encode(packed.getvalue()).decode("ascii")
     return {"width": width, "height": height, "columns": columns, "sheet": f"data:image/jpeg;base64,{text}"}
-
-
-def _on_white(rgba: np.ndarray) -> np.ndarray:
-    alpha = rgba[..., 3:].astype(np.float32) / 255
-    return np.rint(rgba[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)

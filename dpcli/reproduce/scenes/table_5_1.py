@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -37,13 +36,12 @@ dpc = partial(runs.dpc, threads=1)  # a clip each in as many processes as there 
 
 
 def film_mesh(meshes: Path, word: str, side: str, out: Path, size: int, frames: int) -> Path:
-    """Returns the views file of `MODEL.glb:CLIP`, filmed from a side of YAW; made where it isn't there."""
+    """Returns the views file of `MODEL.glb:CLIP`, filmed from a side of YAW; `dpc prepare` passes over what is there."""
     model, clip = word.split(":")
     path = out / f"{model.replace('/', '-').removesuffix('.glb')}-{clip}-{side}.h5"
-    if not path.exists():
-        turned = ("--clip", clip, "--yaw", YAW[side], "--train-azimuths", "60,-30,150,-120")
-        words = ("--size", size, "--frames", frames, "--jobs", 1, *turned)
-        dpc("prepare", "animation", find_model(meshes, model), "-o", path, *words)
+    turned = ("--clip", clip, "--yaw", YAW[side], "--train-azimuths", "60,-30,150,-120")
+    words = ("--size", size, "--frames", frames, "--jobs", 1, *turned)
+    dpc("prepare", "animation", find_model(meshes, model), "-o", path, *words)
     return path
 
 
@@ -51,11 +49,10 @@ def film_artemis(folder: Path, out: Path, size: int, frames: int) -> list[Path]:
     """Returns the views file of every motion of every animal below an ARTEMIS folder."""
     made = []
     for animal in sorted(path.parent for path in folder.glob("*/CamPose.inf")):
-        for motion in sorted(path.name for path in (animal / "img").iterdir() if path.is_dir()):
+        for motion in sorted(path.name for path in animal.glob("img/*") if path.is_dir()):
             path = out / f"{animal.name}-{motion}-artemis.h5"
-            if not path.exists():
-                words = ("--motion", motion, "--size", size, "--frames", frames)
-                dpc("prepare", "artemis", animal, "-o", path, *words)
+            words = ("--motion", motion, "--size", size, "--frames", frames)
+            dpc("prepare", "artemis", animal, "-o", path, *words)
             made.append(path)
     if not made:
         sys.exit(
@@ -91,7 +88,7 @@ def score(views: Path, row: str, words: tuple[str, ...], learned: bool) -> dict:
             prior = next(name for name, title in FITS.items() if title == row)
             if prior == "views" and not _has_train(views):
                 return {}
-            dpc("generate4d", "fit", views, "-o", made, "--prior", prior, *words, "--force")
+            dpc("generate4d", "fit", views, "-o", made, "--prior", prior, *words)
         scene = () if row in LAYERS else ("parts", "tracks", "surface")
         metrics = ",".join((*PICTURES, *(LEARNED if learned else ()), *scene))
         return json.loads(dpc("evaluate", "video", made, "--truth", views, "--metrics", metrics, "--json"))["metrics"]
@@ -167,10 +164,9 @@ def main() -> None:
         film = partial(film_mesh, given.meshes, out=given.out, size=given.size or 256, frames=given.frames)
         clips = {side: [film(word, side) for word in given.clips.split(",")] for side in YAW}
     tables = []
-    with ThreadPoolExecutor(given.jobs) as pool:
-        for side, views in clips.items():
-            running = {row: [pool.submit(score, v, row, tuple(fit), given.learned) for v in views] for row in rows}
-            tables.append(table({row: [job.result() for job in jobs] for row, jobs in running.items()}, side))
+    for side, views in clips.items():
+        work = {row: [partial(score, one, row, tuple(fit), given.learned) for one in views] for row in rows}
+        tables.append(table(runs.side_by_side(work, given.jobs), side))
     runs.write_text(given.out / "table.md", "\n\n".join(tables) + "\n")
     print("\n\n".join(tables))
 

@@ -14,7 +14,6 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -34,52 +33,36 @@ dpc = partial(runs.dpc, threads=1)  # a clip each in as many processes as there 
 
 
 def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
-    """Returns the views file of `Model:Clip`, which it makes when it isn't there."""
+    """Returns the views file of `Model:Clip`; `dpc prepare` passes over what is there."""
     model, motion = clip.split(":")
     found = sorted(meshes.rglob(f"{model}.glb"))
     if not found:
         sys.exit(f"{meshes}: no {model}.glb in it")
     path = out / f"{model}-{motion}.h5"
-    if not path.exists():
-        dpc(
-            "prepare",
-            "animation",
-            found[0],
-            "--clip",
-            motion,
-            "-o",
-            path,
-            "--size",
-            size,
-            "--yaw",
-            90,
-            "--train-azimuths",
-            "15,-75,105,195",
-            "--azimuths",
-            "60,-30,150,240",
-        )
+    cameras = ("--yaw", 90, "--train-azimuths", "15,-75,105,195", "--azimuths", "60,-30,150,240")
+    dpc("prepare", "animation", found[0], "--clip", motion, "-o", path, "--size", size, *cameras)
     return path
 
 
-def score(views: Path, name: str, settings: Sequence[str], out: Path, given: argparse.Namespace) -> dict:
-    """Returns the scores of one fit to one clip, from its file when that was done before.
+def score(views: Path, name: str, settings: Sequence[str], given: argparse.Namespace) -> dict:
+    """Returns the scores of one fit to one clip, made where that was not done before by the same words.
 
     name: of the fit, in its files' names; settings: what it changes, each `NAME=VALUE`.
     """
     prior = "" if given.prior == "views" else given.prior
-    scene = out / f"{views.stem}{name}{prior}seed{given.seed}.h5"
-    result = scene.with_suffix(".json")
-    if not result.exists():
-        if not scene.exists():
-            dense, sparse = given.steps
-            settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "most_gaussians=6000", *settings]
-            words = [word for value in settings for word in ("--set", value)]
-            common = ("--preset", "quick", "--prior", given.prior, "--seed", given.seed)
-            dpc("generate4d", "fit", views, "-o", scene, *common, *words)
+    scene = given.out / f"{views.stem}{name}{prior}seed{given.seed}.h5"
+    dense, sparse = given.steps
+    settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "most_gaussians=6000", *settings]
+    words = [word for value in settings for word in ("--set", value)]
+    words = ["--preset", "quick", "--prior", given.prior, "--seed", given.seed, *words]
+
+    def work() -> dict:
+        dpc("generate4d", "fit", views, "-o", scene, *words)
         text = dpc("evaluate", "video", scene, "--truth", views, "--metrics", "psnr,ssim,parts,tracks", "--json")
-        result.write_text(text)
-    told = json.loads(result.read_text())
-    return {**told["metrics"], "counts": told["denominators"]}
+        told = json.loads(text)
+        return {**told["metrics"], "counts": told["denominators"]}
+
+    return runs.once(scene.with_suffix(".json"), [runs.digest(views), *words], work)
 
 
 def mean_score(values: list[dict], *keys: str) -> float:
@@ -144,12 +127,10 @@ def fit_all(given: argparse.Namespace, fits: Mapping[str, tuple[str, Sequence[st
     """Returns the scores of all clips for each fit. fits: row -> name in the files, settings (see `score`)."""
     given.out.mkdir(parents=True, exist_ok=True)
     views = [film(given.meshes, clip, given.out, given.size) for clip in given.clips]
-    with ThreadPoolExecutor(given.jobs) as pool:
-        running = {
-            row: [pool.submit(score, path, name, settings, given.out, given) for path in views]
-            for row, (name, settings) in fits.items()
-        }
-        return {row: [job.result() for job in jobs] for row, jobs in running.items()}
+    work = {
+        row: [partial(score, path, name, settings, given) for path in views] for row, (name, settings) in fits.items()
+    }
+    return runs.side_by_side(work, given.jobs)
 
 
 def main() -> None:

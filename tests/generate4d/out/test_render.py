@@ -19,6 +19,7 @@ from dpcli.generate4d.render_settings import CATALOG
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
+from tests.support.commands import told
 from tests.support.scenes import toy_scene
 
 
@@ -292,3 +293,9 @@ def test_the_command_draws_and_refuses(scene, tmp_path):
         refused = CliRunner().invoke(app, [*words, *more])
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
     assert not (tmp_path / "b.mp4").exists()
+
+
+def test_one_picture_is_counted_as_drawn(scene, tmp_path):
+    write_scene(tmp_path / "s.h5", scene)
+    done = told("generate4d", "render", tmp_path / "s.h5", "-o", tmp_path / "a.png", "--size", 16)
+    assert done.returncode == 0 and "render 1/1 100%" in done.stderr

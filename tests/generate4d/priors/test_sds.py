@@ -176,17 +176,21 @@ def test_stable_zero123_gets_the_polar_angle(folder: Path, video: np.ndarray) ->
 
 
 def test_checker_rejects_broken_twins(model: Zero123Model, video: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(**options: object) -> ScoreDistillation:
-        return prepared(ScoreDistillation(model, image_size=SIZE, **options), video)
+    def make() -> ScoreDistillation:
+        return prepared(ScoreDistillation(model, image_size=SIZE), video)
 
     scaled = make()
     scaled._reference = scaled._reference * 0.18215
     black = prepared(
         ScoreDistillation(model, image_size=SIZE), np.concatenate([video[..., :3], 255 + 0 * video[..., 3:]], -1)
     )
-    for broken in (make(guidance_scale=4), make(t_range=(0.51, 0.8)), scaled, black):
+    for broken in (scaled, black):
         with pytest.raises(AssertionError):
             assert_is_equation_c11(broken, video)
+    for name, value in (("_GUIDANCE", 4), ("_T_RANGE", (0.51, 0.8))):
+        with monkeypatch.context() as patch, pytest.raises(AssertionError):
+            patch.setattr(zero123, name, value)
+            assert_is_equation_c11(make(), video)
     for flip in ((1, -1), (-1, 1)):
 
         def flipped(cameras: list, reference: float | None = None, flip: tuple = flip) -> torch.Tensor:
@@ -234,11 +238,6 @@ def test_timestep_anneals_within_its_range() -> None:
     assert annealed_timestep(0.0, (0.0, 1.0), 1000) == 999  # the model has steps 0..999
 
 
-def test_random_timesteps_cover_their_range(model: Zero123Model) -> None:
-    prior = ScoreDistillation(model, timestep="random", t_range=(0.3, 0.31))
-    assert prior._timesteps(500, 0.9, seeded()).unique().tolist() == list(range(300, 311))
-
-
 def test_repeats_with_the_generator_and_leaves_the_global_one_alone(prior: ScoreDistillation) -> None:
     state = torch.get_rng_state()
     once, again, other = gradient_of(prior), gradient_of(prior), gradient_of(prior, seed=8)
@@ -275,11 +274,6 @@ def test_conditions_each_frame_once(model: Zero123Model, video: np.ndarray) -> N
         assert sum(seen) == 21
     finally:
         hook.remove()
-
-
-def test_low_memory_changes_nothing(model: Zero123Model, video: np.ndarray, prior: ScoreDistillation) -> None:
-    sparing = prepared(ScoreDistillation(model, image_size=SIZE, low_memory=True), video)
-    torch.testing.assert_close(gradient_of(sparing), gradient_of(prior), rtol=1e-4, atol=1e-6)
 
 
 def test_larger_renders_and_oblong_frames(model: Zero123Model, video: np.ndarray) -> None:
@@ -326,10 +320,6 @@ def test_rejects_wrong_arguments(model: Zero123Model, prior: ScoreDistillation) 
             prior.loss(wrong, cameras, frames, 0.0, seeded())
     with pytest.raises(ValueError, match="given 0 frames"):
         ScoreDistillation(model).loss(images, CAMERAS, FRAMES, 0.0, seeded())
-    with pytest.raises(ValueError, match="t_range"):
-        ScoreDistillation(model, t_range=(200, 800))
-    with pytest.raises(ValueError, match="timestep"):
-        ScoreDistillation(model, timestep="sometimes")
 
 
 def changed(folder: Path, target: Path, change: Callable[[Path], object]) -> str:
@@ -392,7 +382,7 @@ def test_code_in_a_bin_file_is_not_run(folder: Path, tmp_path: Path) -> None:
         file.unlink()
         file.with_suffix(".bin").write_bytes(pickle.dumps(Payload(), protocol=2))
 
-    with pytest.raises(DataError, match="expected tensors proj.weight"):
+    with pytest.raises(DataError, match="not a file of plain tensors"):
         load_zero123(changed(folder, tmp_path / "evil", change), CPU)
     assert not (tmp_path / "run").exists()
 
@@ -439,7 +429,7 @@ def test_loads_as_the_command_does(
     folder: Path, video: np.ndarray, prior: ScoreDistillation, capsys: pytest.CaptureFixture
 ) -> None:
     loaded = prepared(ScoreDistillation.load(str(folder), "cpu", image_size=SIZE), video)
-    assert torch.equal(gradient_of(loaded), gradient_of(prior))
+    torch.testing.assert_close(gradient_of(loaded), gradient_of(prior), rtol=1e-4, atol=1e-6)
     shown = capsys.readouterr()
     assert "a minute a step" in shown.err and not shown.out
 

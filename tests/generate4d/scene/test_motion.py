@@ -69,7 +69,8 @@ def test_the_blend_is_equation_5_6_with_the_displacement():
     """One point after the other, by hand; and eq. 5.6 as printed (a position in place of a displacement) is not that."""
     field, points = _field(), torch.randn(5, 3)
     motion = field(points, TIMES)
-    turn, shift = quaternion_to_matrix(motion.part_quaternion), motion.part_translation
+    turn, shift = field.part_motion(TIMES)
+    turn = quaternion_to_matrix(turn)
     alone = _field(rigid=False)(points, TIMES).displacement
     for b in range(3):
         for n in range(5):
@@ -81,9 +82,9 @@ def test_the_blend_is_equation_5_6_with_the_displacement():
 
 def test_without_fusion_the_two_are_added_and_without_rigid_only_the_rest_is_left():
     points = torch.randn(6, 3)
-    added, alone = _field(fusion=False)(points, TIMES), _field(rigid=False)(points, TIMES)
-    moved = torch.einsum("bns,bsij,nj->bni", added.part, quaternion_to_matrix(added.part_quaternion), points)
-    moved = moved + added.part @ added.part_translation
+    field = _field(fusion=False)
+    added, alone, (turn, shift) = field(points, TIMES), _field(rigid=False)(points, TIMES), field.part_motion(TIMES)
+    moved = torch.einsum("bns,bsij,nj->bni", added.part, quaternion_to_matrix(turn), points) + added.part @ shift
     torch.testing.assert_close(added.displacement, moved - points + alone.displacement)
     assert (alone.weight == 0).all() and (added.weight == 1).all()
     assert (added.quaternion[..., 0] >= 0).all()
@@ -136,7 +137,7 @@ def test_neighbors_and_spatial_loss_by_brute_force(count, most, radius):
 
 def _motion(quaternion: torch.Tensor, displacement: torch.Tensor) -> Motion:
     none = torch.zeros(0)
-    return Motion(displacement, quaternion, none, none, none, none)
+    return Motion(displacement, quaternion, none, none)
 
 
 def test_skinning_is_equation_5_8_in_loops():

@@ -12,7 +12,7 @@ class LivePage extends PointsPage {
 
   async start() {
     const { live } = this;
-    this.table = await unpacked($("data1").textContent, live.bytes);
+    this.table = new Uint16Array((await unpacked($("data1").textContent, live.bytes)).buffer);
     this.lanes = $("lanes");
     this.lanes.onpointerdown = (event) => { this.lanes.setPointerCapture(event.pointerId); this.seek(event); };
     this.lanes.onpointermove = (event) => { if (event.buttons) this.seek(event); };
@@ -35,7 +35,7 @@ class LivePage extends PointsPage {
 
   // The best classes of a prediction, the surest first: [class, probability].
   best(at, most = 5) {
-    return [...this.row(at)].map((value, k) => [k, value / 255]).sort((a, b) => b[1] - a[1]).slice(0, most);
+    return [...this.row(at)].map((value, k) => [k, value / 65535]).sort((a, b) => b[1] - a[1]).slice(0, most);
   }
 
   label(at) {
