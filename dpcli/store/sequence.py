@@ -138,9 +138,8 @@ class CloudSequence:
                 f"{where}: {bad} of {counted(len(self.points), 'point')} NaN or infinite; drop them before writing"
             )
         if self.label < -1 or (num_classes and self.label >= num_classes):
-            raise DataError(
-                f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}"
-            )
+            known = f"0..{num_classes - 1}" if num_classes else "0, 1, ..."
+            raise DataError(f"{where}: label {self.label} is out of range; expected -1 (unknown) or {known}")
         self.validate_index()
         self._validate_fields(where)
 

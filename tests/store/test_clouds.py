@@ -162,6 +162,11 @@ def test_malformed_samples_are_refused(tmp_path, three, make_sequence, change, m
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_label_below_the_unknown_one_is_refused_without_classes(three):
+    with pytest.raises(DataError, match=r"label -2 is out of range; expected -1 .unknown. or 0, 1, \.\.\.$"):
+        _bad(three[0], label=-2).validate()
+
+
 def test_reader_crosses_process_borders(tmp_path, three):
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)
