@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import why_unreadable
 from dpcli.runtime.whole_file import DiskFull, check_length, check_regular, check_writable, disk_full, refuse_pipe
 
@@ -50,9 +50,9 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
         try:
             yield path
-        except DataError as error:  # the copy is gone when somebody reads the message
+        except DpcError as error:  # the copy is gone when somebody reads the message
             said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), "stdin")
-            raise DataError(said) from error.__cause__
+            raise type(error)(said) from error.__cause__
 
 
 @contextmanager
@@ -130,8 +130,10 @@ def _regular_file(stream: BinaryIO) -> Path | None:
     """Returns the path of a redirected regular file (`dpc ... - < a.h5`), else None."""
     try:
         number = stream.fileno()
-        if stat.S_ISREG(os.fstat(number).st_mode) and stream.tell() == 0 and os.path.exists(f"/proc/self/fd/{number}"):
-            return Path(os.readlink(f"/proc/self/fd/{number}"))
+        place = Path(os.readlink(f"/proc/self/fd/{number}"))
+        found = os.fstat(number)
+        if stat.S_ISREG(found.st_mode) and os.path.samestat(place.stat(), found) and stream.tell() == 0:
+            return place  # but a file that was removed meanwhile, whose bytes the stream has all the same
     except (OSError, ValueError):
         pass
     return None
