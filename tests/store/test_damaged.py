@@ -64,6 +64,13 @@ def test_flipped_and_lost_bytes_are_bad_data(clouds):
     assert refused > 5
 
 
+def test_a_damaged_superblock_is_not_taken_for_a_lock(clouds):
+    whole = clouds.read_bytes()
+    clouds.write_bytes(whole[:8] + b"\1" + whole[9:])  # its version
+    with pytest.raises(DataError, match="the HDF5 file is damaged .*superblock"):
+        open_store(clouds)
+
+
 @pytest.mark.parametrize("name", ["points", "name", "split", "label", "frame_offsets", "sequence_offsets"])
 @pytest.mark.parametrize("value", [np.zeros((2, 2, 2)), np.zeros(1, "S3"), np.float64(7), b"text"])
 def test_other_types_and_shapes_are_bad_data(clouds, name, value):
