@@ -124,15 +124,7 @@ def test_no_kernel_that_reorders_is_called_by_another_one():
     for path in PACKAGE.rglob("*.py"):
         kernels |= {name: (mark, one) for name, (mark, one) in _decorated(ast.parse(path.read_text("utf-8"))).items()}
     reordering = {name for name, (mark, _) in kernels.items() if mark in ("piece_kernel", "parallel_kernel")}
-    compiled = (
-        "kernel",
-        "piece_kernel",
-        "parallel_kernel",
-        "arithmetic_kernel",
-        "inlined",
-        "inlined_piece",
-        "_inlined",
-    )
+    compiled = ("kernel", "piece_kernel", "parallel_kernel", "arithmetic_kernel", "inlined", "inlined_piece")
     for name, (mark, function) in kernels.items():
         inside = [one.func for one in ast.walk(function) if isinstance(one, ast.Call)]
         names = {one.id for one in inside if isinstance(one, ast.Name)} if mark in compiled else set()
