@@ -48,11 +48,18 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
             shutil.copyfileobj(stream, spool, _PIECE)
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
-        try:
+        with _named(path, "stdin"):
             yield path
-        except DpcError as error:  # the copy is gone when somebody reads the message
-            said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), "stdin")
-            raise type(error)(said) from error.__cause__
+
+
+@contextmanager
+def _named(path: Path, name: str) -> Iterator[None]:
+    """Lets errors of the block name a stream, not its copy at `path`, which is gone when somebody reads the message."""
+    try:
+        yield
+    except DpcError as error:
+        said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), name)
+        raise type(error)(said) from error.__cause__
 
 
 @contextmanager
@@ -155,7 +162,8 @@ def output_file(argument: str | Path, stdout: BinaryIO | None = None) -> Iterato
         raise UsageError("refusing to write HDF5 to a terminal; use -o FILE, or pipe into another dpc command")
     with _spool() as folder:
         path = folder / "stdout.h5"
-        yield path
+        with _named(path, "stdout"):
+            yield path
         with open(path, "rb") as spool:
             shutil.copyfileobj(spool, stream, _PIECE)
         stream.flush()

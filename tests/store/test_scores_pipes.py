@@ -134,9 +134,11 @@ def test_a_redirected_file_that_was_removed_is_read_all_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("error", [DataError, UsageError])
-def test_a_message_names_stdin_and_not_its_copy(error):
+def test_a_message_names_the_stream_and_not_its_copy(error):
     with pytest.raises(error, match="^stdin: no; `dpc info -`$"), input_file("-", io.BytesIO(b"some")) as path:
         raise error(f"{path}: no; `dpc info {path}`")
+    with pytest.raises(error, match="^stdout: not one$"), output_file("-", io.BytesIO()) as path:
+        raise error(f"{path}: not one")
 
 
 def test_empty_pipe_and_terminal_end_with_a_sentence():
