@@ -151,7 +151,8 @@ def _refuse_lengths(item: h5py.Dataset, path: Path) -> None:
     if item.chunks is None:
         places = [(item.id.get_offset(), item.size)]
     else:
-        chunks = [item.id.get_chunk_info(number) for number in range(item.id.get_num_chunks())]
+        chunks: list = []
+        item.id.chunk_iter(chunks.append)  # asked for one by one, HDF5 would go through all of them for each
         places = [(chunk.byte_offset, chunk.size // _TEXT.itemsize) for chunk in chunks]
     size = path.stat().st_size
     with path.open("rb") as file:
