@@ -22,6 +22,7 @@ OF_PARTS = {
 }  # name -> shape of what is said of one part in one frame
 
 LONGEST = 1e12  # the cube of which float32 still holds; a street in nanometers is shorter
+TOLERANCE = 1e-3  # of rotations, unit quaternions and probabilities in float32
 NO_LENGTHS = f"NaN, infinity or a number beyond {LONGEST:.0e}"
 
 
@@ -32,6 +33,20 @@ def are_lengths(values: np.ndarray) -> bool:
     (True, False, False)
     """
     return not values.size or bool(-LONGEST < values.min() and values.max() < LONGEST)
+
+
+def are_rigid(motions: np.ndarray) -> np.ndarray:
+    """Returns which of (...,4,4) are a rotation and a translation, last row 0 0 0 1, bool (...). NaN and infinity are not.
+
+    >>> are_rigid(np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])])).tolist()
+    [True, False]
+    """
+    rotation = motions[..., :3, :3].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        square = rotation @ rotation.swapaxes(-1, -2)
+    rigid = (np.abs(square - np.eye(3)) < TOLERANCE).all((-1, -2)) & (motions[..., 3, :] == [0, 0, 0, 1]).all(-1)
+    rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
+    return rigid
 
 
 @dataclass
