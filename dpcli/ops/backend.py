@@ -96,16 +96,16 @@ def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
     if not tensor.is_floating_point():
         raise ValueError(f"{name} must be floating point, but is {tensor.dtype}")
     tensor = tensor.detach().to(torch.float32)
-    if not _is_finite(tensor):
+    if not is_finite(tensor):
         raise ValueError(f"{name} holds NaN or infinite coordinates; remove those points first")
     return tensor
 
 
-def _is_finite(tensor: torch.Tensor) -> bool:
+def is_finite(tensor: torch.Tensor) -> bool:
     """Returns whether all values are finite; their sum is the cheaper first look, numpy's wakes no OpenMP threads."""
     if tensor.device.type == "cpu":
         with np.errstate(all="ignore"):
-            array = tensor.numpy()
+            array = tensor.detach().numpy()
             return bool(np.isfinite(array.sum()) or np.isfinite(array).all())
     return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
