@@ -82,6 +82,8 @@ class CloudSequence:
     def from_frames(cls, name: str, frames: list[np.ndarray], **fields: Any) -> CloudSequence:
         """Makes a sequence from a list of (N_t,3) arrays; per-point fields are given as lists of per-frame arrays, too.
 
+        Raises DataError where a field holds numbers that its type can't hold, such as a part of 40,000.
+
         >>> waving = CloudSequence.from_frames("a", [np.zeros((2, 3)), np.ones((1, 3))], label=4)
         >>> waving.num_frames, waving.frame_offsets.tolist(), waving.frame(1).tolist()
         (2, [0, 2, 3], [[1.0, 1.0, 1.0]])
@@ -90,7 +92,7 @@ class CloudSequence:
         points = np.concatenate(frames).astype(np.float32, copy=False) if frames else np.zeros((0, 3), np.float32)
         for key in POINT_FIELDS.keys() & fields.keys():
             if fields[key] is not None:
-                fields[key] = np.concatenate(fields[key]).astype(POINT_FIELDS[key][0], copy=False)
+                fields[key] = _in_type_of(key, np.concatenate(fields[key]), name)
         return cls(name, points, offsets, **fields)
 
     @property
@@ -215,3 +217,13 @@ class CloudSequence:
                     f"{where}: joint of part {part} in frame {frame} has parent {parents[frame, part]:g} and type"
                     f" {types[frame, part]:g}, expected a part or -1, and 0 to {len(TYPES) - 1}"
                 )
+
+
+def _in_type_of(key: str, values: np.ndarray, name: str) -> np.ndarray:
+    dtype = POINT_FIELDS[key][0]
+    if dtype.kind in "iu" and values.dtype != dtype and values.size:  # numpy would let what doesn't fit wrap around
+        least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
+        if not (least <= values.min() and values.max() <= most):
+            found = f"{values.min():g} to {values.max():g}"
+            raise DataError(f"sample {name!r}: {key} holds {found}, expected {least} to {most} ({dtype})")
+    return values.astype(dtype, copy=False)

@@ -163,6 +163,20 @@ def test_malformed_samples_are_refused(tmp_path, three, make_sequence, change, m
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "key, values, said",
+    [
+        ("part", [0, 65537], "part holds 0 to 65537, expected -32768 to 32767 .int16."),
+        ("part", [0.0, np.nan], "part holds nan to nan"),
+        ("color", [[0, 0, 256]] * 2, "color holds 0 to 256, expected 0 to 255 .uint8."),
+        ("track", np.uint64([0, 2**63]), "track holds 0 to 9.22337e.18"),
+    ],
+)
+def test_numbers_that_a_field_cannot_hold_are_refused(key, values, said):
+    with pytest.raises(DataError, match=said):
+        CloudSequence.from_frames("a", [np.zeros((2, 3))], **{key: [np.array(values)]})
+
+
 def test_a_label_below_the_unknown_one_is_refused_without_classes(three):
     with pytest.raises(DataError, match=r"label -2 is out of range; expected -1 .unknown. or 0, 1, \.\.\.$"):
         _bad(three[0], label=-2).validate()
