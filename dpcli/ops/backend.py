@@ -119,18 +119,6 @@ def check_rows(idx: torch.Tensor, count: int) -> None:
         raise ValueError(f"idx must lie in 0..{count - 1}, but spans {int(idx.min())}..{int(idx.max())}")
 
 
-def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:
-    """Checks ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
-    if lengths is None:
-        return None
-    lengths = torch.as_tensor(lengths, device=device)
-    if lengths.shape != (batch,) or lengths.is_floating_point():
-        raise ValueError(f"lengths must be {batch} integers, but is {lengths.dtype} of shape {tuple(lengths.shape)}")
-    if batch and not (1 <= int(lengths.min()) and int(lengths.max()) <= most):
-        raise ValueError(f"lengths must lie in 1..{most}, but span {int(lengths.min())}..{int(lengths.max())}")
-    return lengths.to(torch.int64)
-
-
 def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Computes squared distances (B,M,N) of a (B,M,3) and b (B,N,3): (dx*dx + dy*dy) + dz*dz, the order every kernel keeps."""
     dx, dy, dz = ((a[..., axis, None] - b[..., None, :, axis]) for axis in range(3))
