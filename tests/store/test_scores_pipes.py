@@ -36,6 +36,9 @@ def test_bad_rows_are_refused(tmp_path):
         ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer,
     ):
         writer.write("v", np.array([0.5, np.nan]))
+    for name, row, told in (("a\0b", np.ones(1), "holds NUL"), ("v", np.array([1e39]), "1 finite numbers")):
+        with pytest.raises(DataError, match=told), ScoresWriter(tmp_path / "s.h5", class_names=["a"]) as writer:
+            writer.write(name, row)
     with pytest.raises(DataError, match="not one sample"), ScoresWriter(tmp_path / "s.h5", class_names=["a"]):
         pass
     with (
