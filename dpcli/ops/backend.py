@@ -96,16 +96,16 @@ def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
     if not tensor.is_floating_point():
         raise ValueError(f"{name} must be floating point, but is {tensor.dtype}")
     tensor = tensor.detach().to(torch.float32)
-    if not _is_finite(tensor):
+    if not is_finite(tensor):
         raise ValueError(f"{name} holds NaN or infinite coordinates; remove those points first")
     return tensor
 
 
-def _is_finite(tensor: torch.Tensor) -> bool:
+def is_finite(tensor: torch.Tensor) -> bool:
     """Returns whether all values are finite; their sum is the cheaper first look, numpy's wakes no OpenMP threads."""
     if tensor.device.type == "cpu":
         with np.errstate(all="ignore"):
-            array = tensor.numpy()
+            array = tensor.detach().numpy()
             return bool(np.isfinite(array.sum()) or np.isfinite(array).all())
     return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
@@ -117,18 +117,6 @@ def check_rows(idx: torch.Tensor, count: int) -> None:
     """
     if idx.device.type == "cpu" and idx.numel() and not (0 <= int(idx.min()) and int(idx.max()) < count):
         raise ValueError(f"idx must lie in 0..{count - 1}, but spans {int(idx.min())}..{int(idx.max())}")
-
-
-def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:
-    """Checks ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
-    if lengths is None:
-        return None
-    lengths = torch.as_tensor(lengths, device=device)
-    if lengths.shape != (batch,) or lengths.is_floating_point():
-        raise ValueError(f"lengths must be {batch} integers, but is {lengths.dtype} of shape {tuple(lengths.shape)}")
-    if batch and not (1 <= int(lengths.min()) and int(lengths.max()) <= most):
-        raise ValueError(f"lengths must lie in 1..{most}, but span {int(lengths.min())}..{int(lengths.max())}")
-    return lengths.to(torch.int64)
 
 
 def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,8 @@ def weighted_kabsch(
     zero or more and need no norm. What the points leave open (all equal, on a line) is settled toward no turn.
     A slot of weight below 1e-12 in all, or with NaN or infinite values, gets the identity and zero.
     Differentiable in all three, once; the gradient of the rotation is the polar factor's, finite also where singular
-    values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open.
+    values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open; it fades
+    for points that spread less than about 1e-6, as those of a slot with a single point do by rounding.
     Backends: a numba kernel on CPU in float32 where no gradient is wanted, else torch; equal up to rounding.
     Raises ValueError on shapes that don't fit.
 

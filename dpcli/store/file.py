@@ -80,7 +80,7 @@ def _opening_problem(path: Path, error: Exception) -> str:
     text = str(error)
     if "truncated" in text or "end of file" in text:
         return f"{path}: the HDF5 file is truncated ({path.stat().st_size} bytes are left); make or copy it again"
-    if "lock" in text:
+    if "unable to lock file" in text:  # not any "lock": there is a superblock, too
         return f"{path}: locked by a writer, or on a file system without locks (then set HDF5_USE_FILE_LOCKING=FALSE)"
     return f"{path}: the HDF5 file is damaged ({text.splitlines()[0] if text else type(error).__name__}); make or copy it again"
 
@@ -151,7 +151,8 @@ def _refuse_lengths(item: h5py.Dataset, path: Path) -> None:
     if item.chunks is None:
         places = [(item.id.get_offset(), item.size)]
     else:
-        chunks = [item.id.get_chunk_info(number) for number in range(item.id.get_num_chunks())]
+        chunks: list = []
+        item.id.chunk_iter(chunks.append)  # asked for one by one, HDF5 would go through all of them for each
         places = [(chunk.byte_offset, chunk.size // _TEXT.itemsize) for chunk in chunks]
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -193,11 +194,15 @@ def _check_types(file: h5py.File, path: Path) -> None:
     known = fields_of(str(file.attrs["dpc_kind"]))
     for name, item in file.items():
         field = find_field(known, name)
-        for one in () if field is None else item.values() if field.group and isinstance(item, h5py.Group) else (item,):
-            if not _holds(one, field):
+        if field is None:
+            continue
+        streams = field.group and isinstance(item, h5py.Group)
+        for one in item.values() if streams else (item,):
+            if streams != field.group or not _holds(one, field):
                 found = f"{one.dtype} {one.shape}" if isinstance(one, h5py.Dataset) else "a group"
+                expected = f"{'' if streams == field.group else 'a group of '}{field.in_words()}"
                 raise DataError(
-                    f"{path}: {one.name[1:]!r} holds something else ({found}), expected {field.in_words()}; another program"
+                    f"{path}: {one.name[1:]!r} holds something else ({found}), expected {expected}; another program"
                     " changed it, make it again"
                 )
 

@@ -15,12 +15,12 @@ from dpcli.errors import DataError
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import PACKED, history_of, open_store, read_provenance, root_attributes, write_root
 from dpcli.store.schema import TABLES
+from dpcli.store.sequence import TOLERANCE, are_rigid
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.text_files import parse_json
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _LARGEST_LOG_SCALE = 40  # so that a scale, and its square in a covariance, stay finite in float32
-_TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
 LAYOUT = {field.name: (field.dtype, field.shape) for field in TABLES["gaussians"]}  # data set -> type, shape
 _QUATERNIONS = ("quaternion", "frame_quaternion", "control_quaternion")
@@ -161,19 +161,19 @@ class GaussianScene:
         if np.any(np.diff(self.time) <= 0):
             yield "time must rise from frame to frame"
         for key in _QUATERNIONS:
-            off = np.abs(np.linalg.norm(getattr(self, key), axis=-1) - 1) > _TOLERANCE
+            off = np.abs(np.linalg.norm(getattr(self, key), axis=-1) - 1) > TOLERANCE
             if off.any():
                 yield f"{int(off.sum())} rows of {key} are not of length 1; normalize them before writing"
         for key in ("part_probability", "rigid_weight"):
             value = getattr(self, key)
-            if value.size and (value.min() < -_TOLERANCE or value.max() > 1 + _TOLERANCE):
+            if value.size and (value.min() < -TOLERANCE or value.max() > 1 + TOLERANCE):
                 yield f"{key} holds {value.min():g} to {value.max():g}, expected 0..1"
         if self.part.min() < -1 or self.part.max() >= self.num_parts:
             yield f"part holds {self.part.min()}..{self.part.max()}, expected -1..{self.num_parts - 1}"
         if self.control_radius.size and self.control_radius.min() <= 0:
             yield f"control_radius holds {self.control_radius.min():g}, expected lengths above 0"
         for key in ("part_motion", "camera_world_to_camera"):
-            wrong = ~_rigid(getattr(self, key))
+            wrong = ~are_rigid(getattr(self, key))
             if wrong.any():
                 yield f"{key}{np.argwhere(wrong)[0].tolist()} is not rigid (a rotation and a translation, last row 0 0 0 1)"
         yield from self._header_problems()
@@ -214,14 +214,6 @@ def _check_array(where: str, key: str, value: np.ndarray, dtype: type, shape: tu
         raise DataError(f"{where}: {key} is {found}, expected {np.dtype(dtype)} {expected} = ({names})")
     if not np.isfinite(value).all():
         raise DataError(f"{where}: {int((~np.isfinite(value)).sum())} values of {key} are NaN or infinite; fit again")
-
-
-def _rigid(motion: np.ndarray) -> np.ndarray:
-    """Returns which of (...,4,4) are rigid motions, bool (...)."""
-    rotation = motion[..., :3, :3].astype(np.float64)
-    square = rotation @ rotation.swapaxes(-1, -2)
-    good = (np.abs(square - np.eye(3)) < _TOLERANCE).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
-    return good & (np.linalg.det(rotation) > 0)
 
 
 def write_scene(

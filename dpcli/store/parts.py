@@ -16,9 +16,8 @@ from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import CloudsWriter
 from dpcli.store.file import PACKED, absent
 from dpcli.store.schema import fields_of
-from dpcli.store.sequence import LONGEST, NO_LENGTHS, CloudSequence, are_lengths
+from dpcli.store.sequence import LONGEST, NO_LENGTHS, TOLERANCE, CloudSequence, are_lengths, are_rigid
 
-_TOLERANCE = 1e-3  # of float32 probabilities and rotations
 _FIELD = fields_of("parts")
 
 
@@ -93,18 +92,13 @@ def _check_probability(probability: np.ndarray, where: str) -> None:
             f"{where}: {len(bad)} of {len(probability)} points with NaN or infinite probability, "
             f"the first is point {bad[0]}"
         )
-    wrong = (probability < -_TOLERANCE) | (probability > 1 + _TOLERANCE)
+    wrong = (probability < -TOLERANCE) | (probability > 1 + TOLERANCE)
     if wrong.any():
         raise DataError(f"{where}: probability holds {probability[wrong][0]}, expected 0..1")
 
 
 def _check_motion(motion: np.ndarray, where: str) -> None:
-    """Raises DataError unless motions are rigid: the last row 0 0 0 1, the first three columns a rotation."""
-    rotation = motion[..., :3, :3].astype(np.float64)
-    rigid = (np.abs(motion) < LONGEST).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
-    with np.errstate(invalid="ignore", over="ignore"):
-        rigid &= (np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)) < _TOLERANCE).all((-1, -2))
-        rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
+    rigid = are_rigid(motion) & (np.abs(motion) < LONGEST).all((-1, -2))
     if not rigid.all():
         pair, part = np.argwhere(~rigid)[0]
         raise DataError(

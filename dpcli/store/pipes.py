@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import why_unreadable
 from dpcli.runtime.whole_file import DiskFull, check_length, check_regular, check_writable, disk_full, refuse_pipe
 
@@ -48,11 +48,18 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
             shutil.copyfileobj(stream, spool, _PIECE)
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
-        try:
+        with _named(path, "stdin"):
             yield path
-        except DataError as error:  # the copy is gone when somebody reads the message
-            said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), "stdin")
-            raise DataError(said) from error.__cause__
+
+
+@contextmanager
+def _named(path: Path, name: str) -> Iterator[None]:
+    """Lets errors of the block name a stream, not its copy at `path`, which is gone when somebody reads the message."""
+    try:
+        yield
+    except DpcError as error:
+        said = str(error).replace(f"dpc info {path}", "dpc info -").replace(str(path), name)
+        raise type(error)(said) from error.__cause__
 
 
 @contextmanager
@@ -130,8 +137,10 @@ def _regular_file(stream: BinaryIO) -> Path | None:
     """Returns the path of a redirected regular file (`dpc ... - < a.h5`), else None."""
     try:
         number = stream.fileno()
-        if stat.S_ISREG(os.fstat(number).st_mode) and stream.tell() == 0 and os.path.exists(f"/proc/self/fd/{number}"):
-            return Path(os.readlink(f"/proc/self/fd/{number}"))
+        place = Path(os.readlink(f"/proc/self/fd/{number}"))
+        found = os.fstat(number)
+        if stat.S_ISREG(found.st_mode) and os.path.samestat(place.stat(), found) and stream.tell() == 0:
+            return place  # but a file that was removed meanwhile, whose bytes the stream has all the same
     except (OSError, ValueError):
         pass
     return None
@@ -153,7 +162,8 @@ def output_file(argument: str | Path, stdout: BinaryIO | None = None) -> Iterato
         raise UsageError("refusing to write HDF5 to a terminal; use -o FILE, or pipe into another dpc command")
     with _spool() as folder:
         path = folder / "stdout.h5"
-        yield path
+        with _named(path, "stdout"):
+            yield path
         with open(path, "rb") as spool:
             shutil.copyfileobj(spool, stream, _PIECE)
         stream.flush()

@@ -67,22 +67,23 @@ class ScoresWriter(ResumableWriter):
         the name is new.
         """
         own = streams or {}
+        if "\0" in name + split:
+            raise DataError(f"sample {name!r}: the name or the split {split!r} holds NUL, expected texts")
         if name in self._known:
             raise DataError(f"sample {name!r}: the name appears twice; names identify samples")
         if not -1 <= label < len(self.class_names):
             raise DataError(
                 f"sample {name!r}: label {label}, expected -1 (unknown) or 0 to {len(self.class_names) - 1}"
             )
-        for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
-            if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():
-                raise DataError(
-                    f"sample {name!r}: {key} {np.shape(row)} must be {len(self.class_names)} finite numbers"
-                )
+        with np.errstate(over="ignore"):  # what float32 can't hold is infinite, and told below
+            main, *others = (np.asarray(row, _FIELD["scores"].dtype) for row in (scores, *own.values()))
+        for key, row in zip(("scores", *own), (main, *others)):  # a stream may be called scores, too
+            if row.shape != (len(self.class_names),) or not np.isfinite(row).all():
+                raise DataError(f"sample {name!r}: {key} {row.shape} must be {len(self.class_names)} finite numbers")
         if set(self.streams) != set(own):
             raise DataError(f"sample {name!r}: streams {sorted(own)}, expected {sorted(self.streams)}")
-        main, *single = (
-            np.asarray(row, _FIELD["scores"].dtype) for row in (scores, *(own[key] for key in self.streams))
-        )
+        by_stream = dict(zip(own, others))
+        single = [by_stream[key] for key in self.streams]
         self._known.add(name)
         self._names.append(name)
         self._splits.append(split)

@@ -22,6 +22,7 @@ OF_PARTS = {
 }  # name -> shape of what is said of one part in one frame
 
 LONGEST = 1e12  # the cube of which float32 still holds; a street in nanometers is shorter
+TOLERANCE = 1e-3  # of rotations, unit quaternions and probabilities in float32
 NO_LENGTHS = f"NaN, infinity or a number beyond {LONGEST:.0e}"
 
 
@@ -32,6 +33,20 @@ def are_lengths(values: np.ndarray) -> bool:
     (True, False, False)
     """
     return not values.size or bool(-LONGEST < values.min() and values.max() < LONGEST)
+
+
+def are_rigid(motions: np.ndarray) -> np.ndarray:
+    """Returns which of (...,4,4) are a rotation and a translation, last row 0 0 0 1, bool (...). NaN and infinity are not.
+
+    >>> are_rigid(np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])])).tolist()
+    [True, False]
+    """
+    rotation = motions[..., :3, :3].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        square = rotation @ rotation.swapaxes(-1, -2)
+    rigid = (np.abs(square - np.eye(3)) < TOLERANCE).all((-1, -2)) & (motions[..., 3, :] == [0, 0, 0, 1]).all(-1)
+    rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
+    return rigid
 
 
 @dataclass
@@ -67,6 +82,8 @@ class CloudSequence:
     def from_frames(cls, name: str, frames: list[np.ndarray], **fields: Any) -> CloudSequence:
         """Makes a sequence from a list of (N_t,3) arrays; per-point fields are given as lists of per-frame arrays, too.
 
+        Raises DataError where a field holds numbers that its type can't hold, such as a part of 40,000.
+
         >>> waving = CloudSequence.from_frames("a", [np.zeros((2, 3)), np.ones((1, 3))], label=4)
         >>> waving.num_frames, waving.frame_offsets.tolist(), waving.frame(1).tolist()
         (2, [0, 2, 3], [[1.0, 1.0, 1.0]])
@@ -75,7 +92,7 @@ class CloudSequence:
         points = np.concatenate(frames).astype(np.float32, copy=False) if frames else np.zeros((0, 3), np.float32)
         for key in POINT_FIELDS.keys() & fields.keys():
             if fields[key] is not None:
-                fields[key] = np.concatenate(fields[key]).astype(POINT_FIELDS[key][0], copy=False)
+                fields[key] = _in_type_of(key, np.concatenate(fields[key]), name)
         return cls(name, points, offsets, **fields)
 
     @property
@@ -138,9 +155,8 @@ class CloudSequence:
                 f"{where}: {bad} of {counted(len(self.points), 'point')} NaN or infinite; drop them before writing"
             )
         if self.label < -1 or (num_classes and self.label >= num_classes):
-            raise DataError(
-                f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}"
-            )
+            known = f"0..{num_classes - 1}" if num_classes else "0, 1, ..."
+            raise DataError(f"{where}: label {self.label} is out of range; expected -1 (unknown) or {known}")
         self.validate_index()
         self._validate_fields(where)
 
@@ -201,3 +217,13 @@ class CloudSequence:
                     f"{where}: joint of part {part} in frame {frame} has parent {parents[frame, part]:g} and type"
                     f" {types[frame, part]:g}, expected a part or -1, and 0 to {len(TYPES) - 1}"
                 )
+
+
+def _in_type_of(key: str, values: np.ndarray, name: str) -> np.ndarray:
+    dtype = POINT_FIELDS[key][0]
+    if dtype.kind in "iu" and values.dtype != dtype and values.size:  # numpy would let what doesn't fit wrap around
+        least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
+        if not (least <= values.min() and values.max() <= most):
+            found = f"{values.min():g} to {values.max():g}"
+            raise DataError(f"sample {name!r}: {key} holds {found}, expected {least} to {most} ({dtype})")
+    return values.astype(dtype, copy=False)

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.embedding import EmbeddingReader
-from dpcli.store.file import file_kind, open_store, read_provenance, root_attributes
+from dpcli.store.file import open_store, read_provenance, root_attributes
 from dpcli.store.gaussians import read_scene
 from dpcli.store.parts import PartsReader
 from dpcli.store.scores import ScoresReader
@@ -27,13 +27,15 @@ _SPLITS = ("train", "validation", "val", "test")  # the order people expect
 
 def summary(path: str | Path) -> dict[str, Any]:
     """Returns everything `dpc info` tells, as plain values for JSON. Raises DataError as the readers do."""
-    path, kind = Path(path), file_kind(path)
+    path = Path(path)
     with open_store(path) as file:
+        root = root_attributes(file)
+        kind = str(root["dpc_kind"])
         common = {
             "kind": kind,
             "bytes": path.stat().st_size,
-            **{key: root_attributes(file).get(f"dpc_{key}") for key in ("schema", "version")},
-            **{key: root_attributes(file).get(key) for key in ("source", "seed", "length_unit")},
+            **{key: root.get(f"dpc_{key}") for key in ("schema", "version")},
+            **{key: root.get(key) for key in ("source", "seed", "length_unit")},
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }

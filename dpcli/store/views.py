@@ -97,9 +97,8 @@ class ViewsHeader:
                 raise DataError(
                     f"{self.name!r}: intrinsics of view {view} are not [[fx s cx] [0 fy cy] [0 0 1]], fx, fy > 0"
                 )
-            if (
-                abs(camera[0, 1]) * self.size[1] > camera[1, 1]
-            ):  # shifts the ends of the picture by more than half a pixel
+            # one that shifts the ends of the picture by more than half a pixel
+            if abs(camera[0, 1]) * self.size[1] > camera[1, 1]:
                 raise DataError(
                     f"{self.name!r}: intrinsics of view {view} have a skew of {camera[0, 1]:g}; expected pixels that are "
                     "rectangles, since nothing draws others"

@@ -1,4 +1,4 @@
-"""Farthest point sampling: the definition, ties, ragged batches, and every backend alike."""
+"""Farthest point sampling: the definition, ties, and every backend alike."""
 
 from __future__ import annotations
 
@@ -58,19 +58,6 @@ def test_kernel_survives_extreme_spread() -> None:
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_ragged_batch_never_chooses_padding(name: str) -> None:
-    rng = np.random.default_rng(2)
-    points = torch.from_numpy(cloud(rng, 3, 70, kind="random"))
-    lengths = torch.tensor([70, 9, 40])
-    points[1, 9:] = 1e6
-    with backend(name):
-        index = fps(points, 50, lengths=lengths)
-    for row, cloud_, length in zip(index, points, lengths.tolist(), strict=True):
-        assert row.max() < length
-        assert torch.equal(row, fps_reference(cloud_[None, :length], 50)[0])
-
-
-@pytest.mark.parametrize("name", BACKENDS)
 def test_more_samples_than_points_repeat_the_sequence(name: str) -> None:
     points = torch.from_numpy(cloud(np.random.default_rng(3), 1, 7, kind="random"))
     with backend(name):
@@ -109,9 +96,6 @@ def test_accepts_views_doubles_and_gradients(name: str) -> None:
         (dict(num_samples=0), "num_samples"),
         (dict(start=5), "start"),
         (dict(start=-1), "start"),
-        (dict(lengths=torch.tensor([6])), "lengths"),
-        (dict(lengths=torch.tensor([0])), "lengths"),
-        (dict(lengths=torch.tensor([3]), start=3), "start"),
     ],
 )
 def test_rejects(name: str, change: dict, message: str) -> None:

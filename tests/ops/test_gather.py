@@ -7,6 +7,7 @@ import torch
 
 from dpcli.ops import gather_mean, gather_points
 from dpcli.ops.backend import chosen_backend, reference_only
+from tests.support.ops_helpers import BACKENDS, backend
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
@@ -38,6 +39,45 @@ def test_indices_that_name_no_point_are_refused(function):
             function(features, torch.full((2, 4, 5), wrong))
     with pytest.raises(ValueError, match="do not fit"):
         function(features, torch.zeros(3, 4, 5, dtype=torch.long))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("shape", [(2, 7), (2, 4, 5), (2, 0), (2,)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
+def test_gather_equals_indexing(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(1)
+    features = torch.randn(2, 6, 3, generator=generator).to(dtype).requires_grad_()
+    idx = torch.randint(0, 6, shape, generator=generator)
+    with backend(name):
+        got = gather_points(features, idx)
+        want = torch.stack([features[b][idx[b]] for b in range(2)])
+        assert torch.equal(got, want)
+        if want.numel():
+            upstream = torch.randn(want.shape, generator=generator).to(dtype)
+            ours, theirs = (torch.autograd.grad(out, features, upstream)[0] for out in (got, want))
+            torch.testing.assert_close(ours, theirs, **({"rtol": 0, "atol": 0.02} if dtype == torch.float16 else {}))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_gather_gradients_repeat_exactly(name: str) -> None:
+    """Thousands of rows onto few: threads must not race, and sums keep their order."""
+    features = torch.randn(3, 4, 8, requires_grad=True)
+    idx = torch.randint(0, 4, (3, 5000))
+    with backend(name):
+        grads = [
+            torch.autograd.grad(gather_points(features, idx), features, torch.ones(3, 5000, 8))[0] for _ in range(2)
+        ]
+    assert torch.equal(*grads)
+    counts = torch.stack([torch.bincount(row, minlength=4) for row in idx]).float()
+    assert torch.equal(grads[0], counts[..., None].expand(-1, -1, 8))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_gather_gradcheck(name: str) -> None:
+    features = torch.randn(2, 4, 3, dtype=torch.float64, requires_grad=True)
+    idx = torch.tensor([[0, 0, 3], [1, 2, 1]])
+    with backend(name):
+        assert torch.autograd.gradcheck(lambda f: gather_points(f, idx), (features,))
 
 
 def test_no_neighbors_and_other_shapes_take_the_plain_way():

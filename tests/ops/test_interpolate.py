@@ -1,4 +1,4 @@
-"""Gathering and three-nearest-neighbor interpolation: values, gradients, every backend."""
+"""Three-nearest-neighbor interpolation: values, gradients, every backend."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.ops import gather_points, three_nn_interpolate
+from dpcli.ops import three_nn_interpolate
 from tests.support.ops_helpers import BACKENDS, KINDS, SEEDS, backend, brute_knn, cloud
 
 
@@ -56,51 +56,3 @@ def test_interpolation_gradients(name: str) -> None:
 def test_interpolation_rejects_features_without_their_points() -> None:
     with pytest.raises(ValueError, match="one row for each"):
         three_nn_interpolate(torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), torch.zeros(1, 4, 7))
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("shape", [(2, 7), (2, 4, 5), (2, 0), (2,)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
-def test_gather_equals_indexing(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    generator = torch.Generator().manual_seed(1)
-    features = torch.randn(2, 6, 3, generator=generator).to(dtype).requires_grad_()
-    idx = torch.randint(0, 6, shape, generator=generator)
-    with backend(name):
-        got = gather_points(features, idx)
-        want = torch.stack([features[b][idx[b]] for b in range(2)])
-        assert torch.equal(got, want)
-        if want.numel():
-            upstream = torch.randn(want.shape, generator=generator).to(dtype)
-            ours, theirs = (torch.autograd.grad(out, features, upstream)[0] for out in (got, want))
-            torch.testing.assert_close(ours, theirs, **({"rtol": 0, "atol": 0.02} if dtype == torch.float16 else {}))
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_gather_gradients_repeat_exactly(name: str) -> None:
-    """Thousands of rows onto few: threads must not race, and sums keep their order."""
-    features = torch.randn(3, 4, 8, requires_grad=True)
-    idx = torch.randint(0, 4, (3, 5000))
-    with backend(name):
-        grads = [
-            torch.autograd.grad(gather_points(features, idx), features, torch.ones(3, 5000, 8))[0] for _ in range(2)
-        ]
-    assert torch.equal(*grads)
-    counts = torch.stack([torch.bincount(row, minlength=4) for row in idx]).float()
-    assert torch.equal(grads[0], counts[..., None].expand(-1, -1, 8))
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_gather_gradcheck(name: str) -> None:
-    features = torch.randn(2, 4, 3, dtype=torch.float64, requires_grad=True)
-    idx = torch.tensor([[0, 0, 3], [1, 2, 1]])
-    with backend(name):
-        assert torch.autograd.gradcheck(lambda f: gather_points(f, idx), (features,))
-
-
-@pytest.mark.parametrize(
-    ("idx", "message"),
-    [(torch.tensor([[6], [0]]), "0..5"), (torch.tensor([[-1], [0]]), "0..5"), (torch.tensor([[0]]), "do not fit")],
-)
-def test_gather_rejects(idx: torch.Tensor, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        gather_points(torch.zeros(2, 6, 3), idx)

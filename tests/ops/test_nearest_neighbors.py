@@ -1,4 +1,4 @@
-"""Nearest neighbors: the definition with its ties, scipy's tree, ragged batches, and every backend alike."""
+"""Nearest neighbors: the definition with its ties, scipy's tree, and every backend alike."""
 
 from __future__ import annotations
 
@@ -69,13 +69,9 @@ def test_large_clouds_equal_the_reference(kind: str, k: int) -> None:
         points += rng.integers(0, 12, points.shape).astype(np.float32)
     points[0, :3], query[0, :2] = points[0, 3:4], points[0, :2]  # copies
     arguments = (torch.from_numpy(query), torch.from_numpy(points), k)
-    lengths = torch.tensor([16384, 5])  # a cloud with fewer points than k
     rows = torch.arange(0, 16384, 64)
-    for more in ({}, {"lengths": lengths}):
-        ours = knn(*arguments, **more)
-        reference = knn_reference(arguments[0][:, rows], *arguments[1:], **more)
-        for own, other in zip(ours, reference, strict=True):
-            assert torch.equal(own[:, rows], other)
+    for own, other in zip(knn(*arguments), knn_reference(arguments[0][:, rows], *arguments[1:]), strict=True):
+        assert torch.equal(own[:, rows], other)
 
 
 def test_large_clouds_with_squares_that_overflow_or_vanish() -> None:
@@ -95,19 +91,6 @@ def test_agrees_with_scipy() -> None:
     distance, theirs = cKDTree(points).query(query, 8)
     np.testing.assert_allclose(squared[0].sqrt().numpy(), distance, rtol=1e-5)
     assert (index[0].numpy() == theirs).mean() > 0.999  # float64 may order near-ties otherwise
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_ragged_batch_never_finds_padding(name: str) -> None:
-    rng = np.random.default_rng(4)
-    points, query = (torch.from_numpy(cloud(rng, 3, n, kind="random")) for n in (80, 20))
-    lengths = torch.tensor([80, 2, 41])
-    with backend(name):
-        squared, index = knn(query, points, 5, lengths=lengths)
-        for b, length in enumerate(lengths.tolist()):
-            alone = knn(query[b : b + 1], points[b : b + 1, :length], 5)
-            assert torch.equal(squared[b], alone[0][0]) and torch.equal(index[b], alone[1][0])
-    assert torch.equal(index[1, :, 2:], index[1, :, :1].expand(-1, 3))  # two points: the nearest repeats
 
 
 def test_far_outliers_are_found_last() -> None:

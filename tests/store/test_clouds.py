@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
 import pickle
 import subprocess
 import sys
@@ -162,6 +163,25 @@ def test_malformed_samples_are_refused(tmp_path, three, make_sequence, change, m
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "key, values, said",
+    [
+        ("part", [0, 65537], "part holds 0 to 65537, expected -32768 to 32767 .int16."),
+        ("part", [0.0, np.nan], "part holds nan to nan"),
+        ("color", [[0, 0, 256]] * 2, "color holds 0 to 256, expected 0 to 255 .uint8."),
+        ("track", np.uint64([0, 2**63]), "track holds 0 to 9.22337e.18"),
+    ],
+)
+def test_numbers_that_a_field_cannot_hold_are_refused(key, values, said):
+    with pytest.raises(DataError, match=said):
+        CloudSequence.from_frames("a", [np.zeros((2, 3))], **{key: [np.array(values)]})
+
+
+def test_a_label_below_the_unknown_one_is_refused_without_classes(three):
+    with pytest.raises(DataError, match=r"label -2 is out of range; expected -1 .unknown. or 0, 1, \.\.\.$"):
+        _bad(three[0], label=-2).validate()
+
+
 def test_reader_crosses_process_borders(tmp_path, three):
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)
@@ -190,8 +210,6 @@ def test_handles_are_kept_closed_and_opened_again(tmp_path, three):
 
 
 def test_a_forked_process_opens_its_own(tmp_path, three):
-    import multiprocessing
-
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)
     handle = reader.file
@@ -211,27 +229,13 @@ def test_a_forked_process_opens_its_own(tmp_path, three):
     assert np.array_equal(reader.read(2).points, three[2].points)
 
 
-def test_several_loader_workers_read_what_one_reads(tmp_path, three):
-    torch = pytest.importorskip("torch")
+def test_several_workers_read_what_one_reads(tmp_path, three):
+    """As a DataLoader's do, but for the import of torch in each."""
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)  # an open handle in the parent must not leak into the workers
-    loader = torch.utils.data.DataLoader(
-        _Sums(reader), batch_size=None, num_workers=2, multiprocessing_context="forkserver"
-    )
-    assert [float(v) for v in loader] == [float(s.points.sum()) for s in three]
-
-
-class _Sums:
-    def __init__(self, reader: CloudsReader) -> None:
-        self.reader = reader
-
-    def __len__(self) -> int:
-        return len(self.reader)
-
-    def __getitem__(self, index: int) -> float:
-        if index >= len(self):
-            raise IndexError
-        return float(self.reader.read(index).points.sum())
+    with multiprocessing.get_context("forkserver").Pool(2) as pool:
+        found = pool.map(reader.read, range(3), chunksize=1)
+    assert [np.array_equal(a.points, b.points) for a, b in zip(found, three, strict=True)] == [True] * 3
 
 
 def _edit(path: Path, change) -> None:

@@ -2,8 +2,6 @@
 
 import gc
 import random
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from itertools import product
@@ -62,6 +60,13 @@ def test_flipped_and_lost_bytes_are_bad_data(clouds):
         clouds.write_bytes(bytes_[:kept])
         refused += _read_or_data_error(clouds)
     assert refused > 5
+
+
+def test_a_damaged_superblock_is_not_taken_for_a_lock(clouds):
+    whole = clouds.read_bytes()
+    clouds.write_bytes(whole[:8] + b"\1" + whole[9:])  # its version
+    with pytest.raises(DataError, match="the HDF5 file is damaged .*superblock"):
+        open_store(clouds)
 
 
 @pytest.mark.parametrize("name", ["points", "name", "split", "label", "frame_offsets", "sequence_offsets"])
@@ -130,10 +135,10 @@ def test_a_chunk_that_is_far_larger_than_its_data_set_is_refused(clouds):
         open_store(clouds)
 
 
-def test_a_damaged_file_is_exit_3_of_the_command(clouds):
+def test_a_damaged_file_is_exit_3_of_the_command(clouds, dpc_here):
     clouds.write_bytes(clouds.read_bytes()[:900])
-    ended = subprocess.run([sys.executable, "-m", "dpcli", "info", str(clouds)], capture_output=True, text=True)
-    assert ended.returncode == 3 and "a bug" not in ended.stderr and str(clouds) in ended.stderr
+    ended = dpc_here("info", clouds)
+    assert ended.returncode == 3 and b"a bug" not in ended.stderr and str(clouds).encode() in ended.stderr
 
 
 READ = {

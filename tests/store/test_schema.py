@@ -112,7 +112,8 @@ def test_values_of_another_sort_are_refused(kind, name, tmp_path):
         if name in file:
             del file[name]
         file[name] = np.arange(3) if field.kind == "str" or field.group else ["no", "numbers"]
-    with pytest.raises(DataError, match=f"'{name}' holds something else .*expected {re.escape(field.in_words())}"):
+    expected = ("a group of " if field.group else "") + field.in_words()
+    with pytest.raises(DataError, match=f"'{name}' holds something else .*expected {re.escape(expected)}"):
         open_store(path)
 
 

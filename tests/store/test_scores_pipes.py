@@ -36,6 +36,9 @@ def test_bad_rows_are_refused(tmp_path):
         ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer,
     ):
         writer.write("v", np.array([0.5, np.nan]))
+    for name, row, told in (("a\0b", np.ones(1), "holds NUL"), ("v", np.array([1e39]), "1 finite numbers")):
+        with pytest.raises(DataError, match=told), ScoresWriter(tmp_path / "s.h5", class_names=["a"]) as writer:
+            writer.write(name, row)
     with pytest.raises(DataError, match="not one sample"), ScoresWriter(tmp_path / "s.h5", class_names=["a"]):
         pass
     with (
@@ -78,7 +81,8 @@ def test_bad_rows_are_refused(tmp_path):
         ("label", np.int32(3), "'label' holds something else"),
         ("scores", None, "'scores' holds something else .a group., expected f32"),
         ("streams/static", None, "'streams/static' holds something else .*expected f32"),
-        ("streams", np.ones(3), "'streams' holds something else .*expected f32"),
+        ("streams", np.ones(3), "'streams' holds something else .*expected a group of f32"),
+        ("streams", np.ones((4, 2), np.float32), "'streams' holds something else .*expected a group of f32"),
         ("provenance", ["[1, 2]"], r"provenance holds \[1, 2\], expected a command's JSON object"),
     ],
 )
@@ -121,6 +125,23 @@ def test_a_redirected_file_is_used_directly(tmp_path):
     path = write(tmp_path / "s.h5")
     with open(path, "rb") as stream, input_file("-", stream) as found:
         assert found.samefile(path)
+
+
+def test_a_redirected_file_that_was_removed_is_read_all_the_same(tmp_path):
+    path = write(tmp_path / "s.h5")
+    data = path.read_bytes()
+    with open(path, "rb") as stream:
+        path.unlink()
+        with input_file("-", stream) as found:
+            assert found.read_bytes() == data
+
+
+@pytest.mark.parametrize("error", [DataError, UsageError])
+def test_a_message_names_the_stream_and_not_its_copy(error):
+    with pytest.raises(error, match="^stdin: no; `dpc info -`$"), input_file("-", io.BytesIO(b"some")) as path:
+        raise error(f"{path}: no; `dpc info {path}`")
+    with pytest.raises(error, match="^stdout: not one$"), output_file("-", io.BytesIO()) as path:
+        raise error(f"{path}: not one")
 
 
 def test_empty_pipe_and_terminal_end_with_a_sentence():

@@ -89,14 +89,14 @@ def _fill_buckets(points, n, order, xyz, box):
 
 
 @kernel
-def bucket_kernel(points, lengths, order, xyz, box, first, last):
-    """Sorts clouds first..last-1 of points (B,N,3) f32, the first lengths[b] points of each, into buckets.
+def bucket_kernel(points, order, xyz, box, first, last):
+    """Sorts clouds first..last-1 of points (B,N,3) f32 into buckets.
 
     Bucket j holds the points order[b, j*BUCKET:(j+1)*BUCKET]; order is (B,N) i32, xyz (B,3,buckets*BUCKET) their
     coordinates, box (B,6,buckets) the rows x min, x max, y min, y max, z min, z max.
     """
     for b in range(first, last):
-        _fill_buckets(points[b], lengths[b], order[b], xyz[b], box[b])
+        _fill_buckets(points[b], points.shape[1], order[b], xyz[b], box[b])
 
 
 @inlined
@@ -212,10 +212,10 @@ def _sample(points, n, start, out):
 
 
 @kernel
-def fps_kernel(points, lengths, start, out, first, last):
-    """Writes farthest points of clouds first..last-1, of points (B,N,3) f32 the first lengths[b] of each, into out (B,S) i64.
+def fps_kernel(points, start, out, first, last):
+    """Writes farthest points of clouds first..last-1, of points (B,N,3) f32, into out (B,S) i64.
 
-    The first sample is `start`, ties go to the lowest index, and samples beyond lengths[b] repeat the sequence.
+    The first sample is `start`, ties go to the lowest index, and samples beyond N repeat the sequence.
     """
     for b in range(first, last):
-        _sample(points[b], lengths[b], start, out[b])
+        _sample(points[b], points.shape[1], start, out[b])

@@ -347,15 +347,15 @@ def _knn_cloud(order, n, xyz, box, bucket, queries, low, high, squared, index):
 
 
 @kernel
-def knn_kernel(order, lengths, xyz, box, bucket, queries, squared, index, first, last):
+def knn_kernel(order, xyz, box, bucket, queries, squared, index, first, last):
     """Fills rows first..last-1, counted through all clouds, of squared (B,M,k) f32 and index (B,M,k) i64.
 
-    order, lengths, xyz, box: of `farthest_point_sampling.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
+    order, xyz, box: of `farthest_point_sampling.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
     `ops.nearest_neighbors.knn`.
     """
     rows = queries.shape[1]
     while first < last:
         b = first // rows
         low, high = first - b * rows, min(last - b * rows, rows)
-        _knn_cloud(order[b], lengths[b], xyz[b], box[b], bucket, queries[b], low, high, squared[b], index[b])
+        _knn_cloud(order[b], order.shape[1], xyz[b], box[b], bucket, queries[b], low, high, squared[b], index[b])
         first += high - low

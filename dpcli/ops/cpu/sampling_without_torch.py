@@ -29,7 +29,7 @@ def fps_numpy(points: np.ndarray, num_samples: int, *, start: int = 0) -> np.nda
     if kernel is None:
         return _fps_plain(points, num_samples, start)
     out = np.empty((1, num_samples), np.int64)
-    kernel(points[None], np.array([len(points)]), start, out, 0, 1)
+    kernel(points[None], start, out, 0, 1)
     return out[0]
 
 

@@ -9,11 +9,10 @@ serve all cameras. Indices are unsigned where it matters: numba then leaves out 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numba import prange
 
-from dpcli.ops.cpu.jit import parallel_kernel
+from dpcli.ops.cpu.jit import inlined_piece, parallel_kernel
 from dpcli.ops.cpu.simd import any_lower, claim, lanes, load, lower, ramp, reciprocal, store, total, where_lower
 from dpcli.ops.splatting.cpu_simd import OWN, constants, power, totals
 from dpcli.ops.splatting.cpu_tile_lists import PACKED, TALL, WIDE
@@ -28,20 +27,19 @@ _BLOCK = 256  # Gaussians gathered as one task
 _CHECK = 16  # Gaussians between two looks for rows where every pixel has stopped
 TABLE = constants(_CAP, _SKIP, _STOP, 1)
 _CAP_AT, _SKIP_AT, _STOP_AT, _ONE_AT = (np.uintp((OWN + i) * WIDE) for i in range(4))
-# Into their callers, where the number of channels is known or not: three are unrolled.
-_inlined = numba.njit(
-    forceinline=True, nogil=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy"
-)
 
 
-@_inlined
+@inlined_piece
 def _add(state, at, more):
     store(state, at, load(state, at) + more)
 
 
-@_inlined
+@inlined_piece
 def _composite(table, state, low, high, left, top, packed, g, colors, color, channels, number):
-    """Composites one Gaussian, `packed` from g and `colors` from color, onto rows low..high-1 of a tile's state."""
+    """Composites one Gaussian, `packed` from g and `colors` from color, onto rows low..high-1 of a tile's state.
+
+    Three channels, where the caller says so by the constant, are unrolled.
+    """
     one_row = (_2 + channels) * _WIDE
     dx = ramp() + lanes(left - packed[g])
     across_x = lanes(packed[g + _5]) + lanes(packed[g + _2]) * dx * dx
@@ -134,7 +132,7 @@ def forward(table, tasks, workers, counter, tile_start, gaussian, packed, colors
             task = claim(counter)
 
 
-@_inlined
+@inlined_piece
 def _retrace(
     table, state, lasts, weights, low, high, left, top, packed, g, colors, color, channels, number, to_color, sums, pair
 ):
@@ -185,7 +183,7 @@ def _retrace(
     store(sums, pair, totals(flat, flat * dx, linear, flat * dx * dx, linear * dx, quadratic, first, second))
 
 
-@_inlined
+@inlined_piece
 def _color_sum(state, weights, low, high, one_row, d):
     summed = lanes(_ZERO)
     for row in range(np.uintp(low), np.uintp(high)):

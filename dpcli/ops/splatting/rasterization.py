@@ -7,15 +7,13 @@ a torch reference and a fast CPU form; on CUDA compositing is gsplat's own kerne
 from __future__ import annotations
 
 import functools
-import math
 import sys
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend
+from dpcli.ops.backend import chosen_backend, is_finite
 from dpcli.ops.splatting.torch_reference import pixels_torch, project_torch, sh_colors
 
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -164,13 +162,6 @@ def _pixels_gsplat(
     return rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, ids)
 
 
-def _finite(tensor: Tensor) -> bool:
-    if not tensor.is_cpu:
-        return bool(torch.isfinite(tensor).all())
-    with np.errstate(all="ignore"):  # numpy's sum wakes no threads of torch's
-        return math.isfinite(tensor.numpy().sum()) or bool(torch.isfinite(tensor).all())
-
-
 def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, render_mode) -> None:
     if render_mode not in _MODES:
         raise ValueError(f"render_mode must be one of {', '.join(_MODES)}, but is {render_mode!r}")
@@ -190,8 +181,6 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, s
     for name, (tensor, tail) in tails.items():
         if tuple(tensor.shape) not in (tail, (cameras, *tail)):
             raise ValueError(f"{name} must have shape {tail} or {(cameras, *tail)}, but has {tuple(tensor.shape)}")
-        if not _finite(tensor.detach()):
-            raise ValueError(f"{name} holds NaN or infinite values")
     if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
         raise ValueError(
             f"sh_degree {sh_degree} needs {(sh_degree + 1) ** 2} coefficients, but colors has {colors.shape[-2]}"
@@ -200,3 +189,7 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, s
         raise ValueError(
             f"backgrounds must have shape {(cameras, colors.shape[-1])}, but has {tuple(backgrounds.shape)}"
         )
+    given = {name: tensor for name, (tensor, _) in tails.items()}
+    for name, tensor in {**given, "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds}.items():
+        if tensor is not None and not is_finite(tensor):
+            raise ValueError(f"{name} holds NaN or infinite values")

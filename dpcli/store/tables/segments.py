@@ -164,9 +164,10 @@ def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
             f"{where}: ends at {end}, which is not after its start {start}; `end` is one past the last frame"
         )
     try:
-        confidence = float(row.get("confidence") or "nan")
+        given = row.get("confidence")
+        confidence = float("nan" if given in (None, "") else given)
     except (TypeError, ValueError, OverflowError):
-        raise DataError(f"{where}: confidence {row.get('confidence')!r}; expected a number") from None
+        raise DataError(f"{where}: confidence {given!r}; expected a number") from None
     name, title = (unicodedata.normalize("NFC", text) for text in (name, title.strip()))  # as macOS takes them apart
     return name, Segment(start, end, title, confidence)
 

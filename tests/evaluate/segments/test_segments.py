@@ -164,6 +164,13 @@ def test_what_is_no_table_is_named(tmp_path, text):
         read_segments(path)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_confidences_come_back_as_they_were_written(suffix):
+    rows = [Segment(0, 4, "a", 0.0), Segment(4, 9, "b", 0.5), Segment(9, 12, "a")]
+    found = read_segments("t", segments_text(Segments({"r": rows}), suffix)).recordings["r"]
+    assert [str(one.confidence) for one in found] == ["0.0", "0.5", "nan"]
+
+
 def test_a_recording_in_which_nothing_happens_has_a_row_without_a_class(tmp_path, capsys):
     guess = table(tmp_path / "p.csv", "a,0,3,wave\nb,0,4,\n")
     with pytest.raises(SystemExit):

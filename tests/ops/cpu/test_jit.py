@@ -99,6 +99,12 @@ def test_a_cache_that_takes_nothing_is_done_without(compiled, monkeypatch, capsy
     assert capsys.readouterr().err.count("half a minute, in every run") == 1
 
 
+def kernel_files() -> dict[Path, str]:
+    """The files that decorate kernels, and their text."""
+    texts = {path: path.read_text("utf-8") for path in PACKAGE.rglob("*.py")}
+    return {path: text for path, text in texts.items() if "from dpcli.ops.cpu.jit import" in text}
+
+
 def names_from(path: Path) -> set[Path]:
     """The files of the package from which a file takes something, but for the decorators."""
     modules = {str(node.module) for node in ast.parse(path.read_text()).body if isinstance(node, ast.ImportFrom)}
@@ -109,7 +115,7 @@ def names_from(path: Path) -> set[Path]:
 def test_the_digest_covers_what_kernels_take_from_other_files():
     """The others named here are called by Python around the kernels."""
     plain = {PACKAGE / "errors.py", PACKAGE / "runtime/clips/images.py", PACKAGE / "segment/flow/motion_proposals.py"}
-    files = [path for path in PACKAGE.rglob("*.py") if "from dpcli.ops.cpu.jit import" in path.read_text()]
+    files = kernel_files()
     assert len(files) > 15 and set().union(*map(names_from, files)) - plain == {*jit._SHARED} - {Path(jit.__file__)}
 
 
@@ -121,18 +127,10 @@ def _decorated(tree: ast.Module) -> dict[str, tuple[str, ast.FunctionDef]]:
 def test_no_kernel_that_reorders_is_called_by_another_one():
     """Such a helper has two compiled forms, and which one runs depends on whether this process compiled it: `inlined_piece`."""
     kernels, called = {}, []
-    for path in PACKAGE.rglob("*.py"):
-        kernels |= {name: (mark, one) for name, (mark, one) in _decorated(ast.parse(path.read_text("utf-8"))).items()}
+    for text in kernel_files().values():
+        kernels |= _decorated(ast.parse(text))
     reordering = {name for name, (mark, _) in kernels.items() if mark in ("piece_kernel", "parallel_kernel")}
-    compiled = (
-        "kernel",
-        "piece_kernel",
-        "parallel_kernel",
-        "arithmetic_kernel",
-        "inlined",
-        "inlined_piece",
-        "_inlined",
-    )
+    compiled = ("kernel", "piece_kernel", "parallel_kernel", "arithmetic_kernel", "inlined", "inlined_piece")
     for name, (mark, function) in kernels.items():
         inside = [one.func for one in ast.walk(function) if isinstance(one, ast.Call)]
         names = {one.id for one in inside if isinstance(one, ast.Name)} if mark in compiled else set()

@@ -265,7 +265,10 @@ def test_gsplat_gets_what_its_functions_ask_for(monkeypatch: pytest.MonkeyPatch)
         ({"colors": torch.zeros(1, 3, 3), "sh_degree": 1}, "needs 4 coefficients"),
         ({"sh_degree": 4}, "sh_degree must be"),
         ({"viewmats": torch.eye(4)}, "viewmats"),
+        ({"viewmats": FRONT * float("nan")}, "viewmats holds NaN"),
+        ({"Ks": lens() / 0}, "Ks holds NaN"),
         ({"backgrounds": torch.zeros(1, 2)}, "backgrounds must have shape"),
+        ({"backgrounds": torch.full((1, 3), float("inf"))}, "backgrounds holds NaN"),
         ({"render_mode": "depth"}, "render_mode must be one of"),
     ],
 )
