@@ -20,7 +20,9 @@ from dpcli.classify.data.validation_split import (
 from dpcli.classify.network import sync_norm
 from dpcli.classify.network.backbones.point_slots import slot_quantiles
 from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.settings import network_config
+from dpcli.classify.stream.sliding_window import StreamPredictor
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -90,6 +92,25 @@ def test_a_video_of_one_frame_or_point_makes_a_clip(tmp_path, points):
     model = Kinet(config)
     for mode in (model.train(), model.eval()):
         assert torch.isfinite(mode.static_logits(torch.from_numpy(clip)[None])).all()
+
+
+def test_a_column_of_one_sign_that_is_mostly_0_is_no_speed(tmp_path):
+    """Such as a count of targets: reversed in time, it keeps its sign."""
+    videos = [video(f"v{k}", seed=k) for k in range(3)]
+    for one in videos:
+        one.extra = {SPEED: np.where(np.arange(len(one.points)) % 3, 0, 5).astype(np.float32)}
+    assert config_of(tmp_path, videos).signed_columns == []
+
+
+def test_a_window_of_an_endless_stream_costs_no_more_at_its_end():
+    config = network_config(Given("sparse", sets=SMALL), 2)
+    config = config.changed(columns=("speed",), scales=(1.0, 0.0, 1.0))
+    predictor = StreamPredictor(
+        Kinet(config).eval(), ModelInfo(config, ["a", "b"], "slots", {"streams": ["static"]}), window=4
+    )
+    predictor.window.count = 10**12  # a list of so many frames would need terabytes
+    frames = np.ones((5, 3, 4), np.float32)
+    assert [made.frame for made in map(predictor.add, frames) if made] == [10**12 + k for k in range(5)]
 
 
 def test_changes_keep_the_order_in_time_and_change_speeds_together(tmp_path):
