@@ -142,19 +142,14 @@ def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
         _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
         base = settings_from(info, reader, values.get("fine_tune"))
         return training_settings(_without_part(given), base)
-    preset = preset_for(reader, given.values)
-    settings = training_settings(_with_preset(given, preset))
+    preset = preset_for(reader, given.values) if given.preset == AUTO else given.preset
+    settings = training_settings(replace(given, preset=preset))
     if given.preset == AUTO and preset == "long":
         log.info(
             f"preset long: the median video has {counted(int(np.median(reader.frame_counts)), 'frame')}, four clips of"
             f" {settings.network.num_frames} or more; clips of a video are judged together (--preset quick: each for itself)"
         )
     return replace(settings, schedule=resolved(settings.schedule, reader))
-
-
-def _with_preset(given: Given, preset: str) -> Given:
-    """Returns what was given with a preset in place of `auto`."""
-    return replace(given, preset=preset) if given.preset == AUTO else given
 
 
 def _train(
@@ -300,7 +295,7 @@ def _notes(videos: _Videos, seed: int) -> dict[str, Any]:
         "data": videos.digest,
         "seed": seed,
         "validation": videos.rule,
-        "trained_on": f"{counted(videos.counts[0], 'video')}",
+        "trained_on": counted(videos.counts[0], "video"),
         NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }

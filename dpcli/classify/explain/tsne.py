@@ -90,13 +90,9 @@ def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
         init="pca",
         learning_rate="auto",
         random_state=scikit_learn_state(seed),
-        method=_method(len(features)),
+        method="exact" if len(features) < 500 else "barnes_hut",
     )
     return fit.fit_transform(scaled.astype(np.float64)).astype(np.float32)
-
-
-def _method(videos: int) -> str:
-    return "exact" if videos < 500 else "barnes_hut"
 
 
 def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBORS) -> float | None:
@@ -105,11 +101,13 @@ def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBO
     Euclidean distances in float64, ties to the lower index; a tied vote goes to the tied class with the nearest member.
     Fewer than k+1 videos: all others vote. None with fewer than two videos or classes.
     """
+    from scipy.spatial.distance import cdist
+
     known = labels >= 0
     vectors, truth = features[known].astype(np.float64), labels[known]
     if len(truth) < 2 or len(np.unique(truth)) < 2:
         return None
-    distance = _distances(vectors)
+    distance = cdist(vectors, vectors)
     np.fill_diagonal(distance, np.inf)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, : min(k, len(truth) - 1)]
     return float(np.mean([_vote(truth[row]) == own for row, own in zip(nearest, truth)]))
@@ -120,12 +118,6 @@ def _vote(labels: np.ndarray) -> int:
     values, first, counts = np.unique(labels, return_index=True, return_counts=True)
     best = counts == counts.max()
     return int(values[best][first[best].argmin()])
-
-
-def _distances(vectors: np.ndarray) -> np.ndarray:
-    from scipy.spatial.distance import cdist
-
-    return cdist(vectors, vectors)
 
 
 def silhouette(features: np.ndarray, labels: np.ndarray) -> float | None:

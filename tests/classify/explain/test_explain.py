@@ -332,8 +332,6 @@ def test_all_points_go_where_normalization_took_the_drawn_ones(data, rule):
 def test_rescaling_and_wrong_questions(data):
     np.testing.assert_allclose(rescaled(np.array([3, 5, 4], np.float32)), [0, 1, 0.5])
     assert not rescaled(np.full(4, 7, np.float32)).any()
-    with pytest.raises(UsageError, match="activation or gradient"):
-        Question("attention")
     reader = CloudsReader(data)  # labels 0 1 2 0 1 2
     picked = [chosen_samples(reader, wanted, range(6)) for wanted in ("2", "3", "4", "v5,v0,v5")]
     assert picked == [[0, 2], [0, 1, 2], [0, 3, 1, 2], [5, 0]]
