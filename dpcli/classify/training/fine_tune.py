@@ -121,11 +121,13 @@ def freeze(branch: nn.Module, part: str) -> None:
 
 
 def train_mode(branch: nn.Module, part: str) -> None:
-    """Sets what learns to training mode, and the rest, batch norms above all, to evaluation mode."""
+    """Sets what learns to training mode, and the rest, batch norms above all, to evaluation mode.
+
+    The branch itself trains whatever learns of it: `PointSlots` then chooses the members that may learn from a clip.
+    """
     branch.train()
-    if part != "all":
-        for name, module in branch.named_modules():
-            module.training = _learns(name, part)
+    for name, module in branch.named_modules():
+        module.training = not name or _learns(name, part)
 
 
 def _learns(module: str, part: str) -> bool:
