@@ -6,6 +6,8 @@ beside the picture, the leave-one-out accuracy of the five nearest neighbors and
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -22,6 +24,7 @@ from dpcli.runtime.signals import stop_requested
 NEIGHBORS = 5
 _PERPLEXITY = 30.0  # by default, and less where there are few videos
 _FEWEST = 4  # videos
+_ROWS = 256  # videos whose distances from all others are held at once
 
 
 def video_features(
@@ -101,16 +104,22 @@ def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBO
     Euclidean distances in float64, ties to the lower index; a tied vote goes to the tied class with the nearest member.
     Fewer than k+1 videos: all others vote. None with fewer than two videos or classes.
     """
-    from scipy.spatial.distance import cdist
-
     known = labels >= 0
     vectors, truth = features[known].astype(np.float64), labels[known]
     if len(truth) < 2 or len(np.unique(truth)) < 2:
         return None
-    distance = cdist(vectors, vectors)
-    np.fill_diagonal(distance, np.inf)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, : min(k, len(truth) - 1)]
+    nearest = _nearest(vectors, min(k, len(truth) - 1))
     return float(np.mean([_vote(truth[row]) == own for row, own in zip(nearest, truth)]))
+
+
+def _nearest(vectors: np.ndarray, k: int) -> Iterator[np.ndarray]:
+    """Yields the indices of the k nearest others of each vector, some rows of distances in memory at a time."""
+    from scipy.spatial.distance import cdist
+
+    for start in range(0, len(vectors), _ROWS):
+        distance = cdist(vectors[start : start + _ROWS], vectors)
+        distance[np.arange(len(distance)), start + np.arange(len(distance))] = np.inf
+        yield from np.argsort(distance, axis=1, kind="stable")[:, :k]
 
 
 def _vote(labels: np.ndarray) -> int:

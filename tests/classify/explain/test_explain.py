@@ -7,12 +7,14 @@ import dataclasses
 import io
 import json
 import sys
+import tracemalloc
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from torch import nn
 
 from dpcli.classify.commands.explain_pac import chosen_samples
@@ -492,6 +494,20 @@ def test_neighbor_accuracy_and_silhouette_against_other_programs():
     assert neighbor_accuracy(line, np.array([0, 0, 1, 1]), k=1) == 0.75
     for one_class in (np.zeros(4, int), np.full(4, -1)):
         assert neighbor_accuracy(line, one_class) is None and silhouette(line, one_class) is None
+
+
+def test_neighbors_of_many_videos_need_no_table_of_all_distances():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 30, 1500)
+    features = (rng.normal(size=(1500, 3)) + 9 * rng.normal(size=(30, 3))[labels]).astype(np.float32)
+    tracemalloc.start()
+    found = neighbor_accuracy(features, labels)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    near = cKDTree(features.astype(np.float64)).query(features, 6)[1][:, 1:]
+    by_hand = np.mean([max(own := labels[row].tolist(), key=own.count) == label for row, label in zip(near, labels)])
+    assert found == pytest.approx(by_hand, abs=1e-3) and 0.5 < found < 1
+    assert peak < 12e6  # all distances: 18 MB, and as much for their order
 
 
 def test_the_map_keeps_clusters_and_repeats_by_seed():
