@@ -15,7 +15,7 @@ from dpcli.classify.network.descriptors import SLOTS
 from dpcli.store import CloudsReader
 from dpcli.store.schema import KEPT, kept_name
 
-_LOOKED_AT, _POINTS = 2000, 20_000_000  # videos and, about, points at most, evenly over the file
+_LOOKED_AT, _POINTS = 2000, 10_000_000  # videos and, about, points at most, evenly over the file
 _MOST = 0.9  # of frames, or of steps between them, for which a rule must hold: counters wrap, clocks stop
 _STEPS = 20  # between frames, or points of a video, at least, before they tell a rule
 _ENOUGH = 8  # videos a class: in fewer, chance can hide what a column says
@@ -52,7 +52,8 @@ def telling_columns(
     points = int(reader.frame_sizes.sum()) * len(sequences) // len(reader)
     some = list(sequences)[:: max(-(-len(sequences) // _LOOKED_AT), -(-points // _POINTS))]
     labels = reader.labels[some] if by_class else None
-    found = {name: _why_not(_column(reader, some, name), labels) for name in names}
+    columns = _columns(reader, some, names)
+    found = {name: _why_not(columns[name], labels) for name in names}
     return tuple(name for name in names if not found[name]), {name: why for name, why in found.items() if why}
 
 
@@ -61,17 +62,19 @@ def not_read(left_out: dict[str, str]) -> str:
     return "; not read: " + ", ".join(f"{name} ({why})" for name, why in left_out.items()) if left_out else ""
 
 
-def _column(reader: CloudsReader, sequences: Sequence[int], name: str) -> list[_Video]:
-    """Returns one column of some videos: one at a time, as all of them together may not fit into memory."""
-    found = []
+def _columns(reader: CloudsReader, sequences: Sequence[int], names: tuple[str, ...]) -> dict[str, list[_Video]]:
+    """Returns some videos by column; columns without missing values share all but these."""
+    found: dict[str, list[_Video]] = {name: [] for name in names}
     for number in sequences:
-        video = reader.read(number, fields=(kept_name(name),))
+        video = reader.read(number, fields=tuple(map(kept_name, names)))
         counts = np.diff(video.frame_offsets)
         frames = np.repeat(np.arange(video.num_frames), counts)
         rows = np.arange(len(frames)) - np.repeat(video.frame_offsets[:-1], counts)
-        values = video.extra[kept_name(name)].astype(np.float64)
-        good = np.isfinite(values)
-        found.append(_Video(values[good], frames[good], rows[good], video.points[good], video.num_frames))
+        for name in names:
+            values = video.extra[kept_name(name)].astype(np.float64)
+            good = np.isfinite(values)
+            own = (values, frames, rows, video.points)
+            found[name].append(_Video(*(own if good.all() else (part[good] for part in own)), video.num_frames))
     return found
 
 
