@@ -140,6 +140,12 @@ class KinetConfig:
         if self.backbone == "slots":
             self._check_columns()
             return
+        for name, plain in (("members", 1), ("copies", False), ("slot_details", False)):
+            if getattr(self, name) != plain:
+                raise UsageError(
+                    f"{name} = {str(getattr(self, name)).lower()}: only the backbone slots has it; leave it out, or take --preset"
+                    " sparse"
+                )
         if self.backbone == "pointnet2":
             self._check_centroids()
         if self.xyz_group and self.group_size < 3:
