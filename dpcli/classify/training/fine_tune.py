@@ -27,7 +27,7 @@ _RATE = 6e-3  # of heads and last layers: at a sixth of it the dynamic stream la
 _EPOCHS = 5, 100  # at least, at most, of what is frozen but for its last layers
 _SHORTEST = 4  # where everything learns: this part of the epochs of a training from nothing, at least
 _UNIT = 2.0  # times as large or small as what a network learned from: another unit
-_LOOKED_AT = 50  # videos
+_LOOKED_AT = 50  # videos at most, evenly over those for training: files are often in the order of their classes
 _TELLING = 16  # points of a frame that tell how tall a body is, at least
 
 
@@ -82,7 +82,8 @@ def _in_its_unit(config: KinetConfig, reader: CloudsReader) -> KinetConfig:
     """
     if config.normalize != "center":
         return config
-    deviation = _deviation(reader, labeled(reader, "train")[:_LOOKED_AT])
+    videos = labeled(reader, "train")
+    deviation = _deviation(reader, videos[:: -(-len(videos) // _LOOKED_AT)])
     if deviation is None or DEVIATION / _UNIT < deviation < DEVIATION * _UNIT:
         return config
     log.warn(
