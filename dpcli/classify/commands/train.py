@@ -68,7 +68,7 @@ class Training:
     """
 
     weights: Path
-    videos: int  # for validation
+    videos: int  # that validated; those too short for a clip may be left out
     accuracy: dict[str, float]
     caveat: str = ""
     forest: float | None = None
@@ -166,7 +166,8 @@ def _train(
     schedule.share(processes.count)
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
-    report_short(videos.training, settings.network.num_frames)
+    for source in filter(None, (videos.training, videos.validation)):
+        report_short(source, settings.network.num_frames)
     report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, videos, folder).to(device)
@@ -191,7 +192,8 @@ def _train(
     accuracy = trainer.validate() if videos.validation is not None else {}
     if not processes.first:
         return None
-    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy, videos.caveat, _forest(videos, seed))
+    judged = len(videos.validation.sequences) if videos.validation is not None else 0
+    return Training(folder.file("best.safetensors"), judged, accuracy, videos.caveat, _forest(videos, seed))
 
 
 def _forest(videos: _Videos, seed: int) -> float | None:
