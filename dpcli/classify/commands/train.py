@@ -174,10 +174,8 @@ def _train(
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, seed))
     _announce(device, processes, videos, settings)
     keep_freed_memory()
-    with (
-        folder if processes.first else nullcontext(),
-        stop_requested() as stop,
-    ):  # last: --force deletes an earlier model
+    # last: --force deletes an earlier model
+    with folder if processes.first else nullcontext(), stop_requested() as stop:
         if processes.first:
             folder.write_settings(settings.to_toml(f"classify train --seed {seed}"))
         processes.wait()  # the others find the folder as it is to be

@@ -123,10 +123,8 @@ class KinetConfig:
         " all of them alone (backbone slots).",
     )
     columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
-    forest: tuple[int, int] = (
-        0,
-        0,
-    )  # trees and nodes of a tree beside each member of the backbone slots, grown from the data
+    # trees and nodes of a tree beside each member of the backbone slots, grown from the data
+    forest: tuple[int, int] = (0, 0)
     scales: tuple[float, ...] = ()  # unit of length, then middle and spread of each column; follow from the data
 
     def __post_init__(self) -> None:

@@ -214,10 +214,8 @@ def test_details_tell_when_something_happens_and_are_not_moved_by_a_point_far_of
     assert torch.equal(before[0, 2], clips[0, 0, :, :3].sort(0).values[4]) and torch.isfinite(before).all()
     clips[0, 2] = 0  # a slot without points
     assert (slot_quantiles(clips).view(4, 5, 3)[2] == 0).all()
-    for details in (
-        True,
-        False,
-    ):  # without layers over time, what is read is a sum and a maximum, or one slot after the other
+    # without layers over time, what is read is a sum and a maximum, or one slot after the other
+    for details in (True, False):
         member = Kinet(config.changed(slot_details=details)).eval().static.members[0]
         member.over_time = torch.nn.ModuleList()
         here, late = (

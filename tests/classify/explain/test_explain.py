@@ -252,9 +252,8 @@ def test_the_dynamic_stream_lights_up_what_moves_and_time_gone_it_does_not(tmp_p
     shape = rng.uniform(-0.05, 0.05, (8, 3))
     sizes = {"points_per_frame": 16, "neighbors": 24, "weighting": "none", "grouping": "balanced"}
     model = network(**sizes)
-    pass_through(
-        model.static.stage1, {axis: (axis, 1.0) for axis in range(3)}
-    )  # relu(x + 1) is linear within the radius
+    # relu(x + 1) is linear within the radius
+    pass_through(model.static.stage1, {axis: (axis, 1.0) for axis in range(3)})
     with torch.no_grad():
         for level in (0, 1):
             unit = model.dynamic.units[level]
@@ -485,12 +484,10 @@ def test_neighbor_accuracy_and_silhouette_against_other_programs():
         by_hand.append((b - a) / max(a, b))
     assert silhouette(more, unknown) == pytest.approx(np.mean(by_hand))
     assert neighbor_accuracy(features, rng.permutation(labels)) < other - 0.1  # shuffled labels are told
-    line = np.array(
-        [[0], [1], [2.1], [3.3]], np.float32
-    )  # each video has one of its own class and two of the other beside it
-    assert (
-        neighbor_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
-    )  # tied votes go to the nearest, which is the other
+    # each video has one of its own class and two of the other beside it
+    line = np.array([[0], [1], [2.1], [3.3]], np.float32)
+    # tied votes go to the nearest, which is the other
+    assert neighbor_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
     assert neighbor_accuracy(line, np.array([0, 0, 1, 1]), k=1) == 0.75
     for one_class in (np.zeros(4, int), np.full(4, -1)):
         assert neighbor_accuracy(line, one_class) is None and silhouette(line, one_class) is None

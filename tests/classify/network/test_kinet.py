@@ -365,9 +365,8 @@ def test_a_static_stream_of_its_own_is_that_of_a_network_of_its_reach_and_the_dy
         expected = model.static.stage2.taps(across[1], pooled)[0]
         assert all(map(torch.equal, stages[1].activations, expected))
         theirs = shared.static.taps(across)[0]
-        assert torch.equal(
-            stages[0].activations[1], theirs[0].activations[1]
-        )  # the first stage reads coordinates alone
+        # the first stage reads coordinates alone
+        assert torch.equal(stages[0].activations[1], theirs[0].activations[1])
         assert not torch.equal(stages[1].activations[1], theirs[1].activations[1])
     assert len(model.train().group(clip)) == 2  # training asks for its own alone
 
