@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 
 NOTE = "confidence"  # the name under which a weights file's notes hold it
-_LEAST = 1e-12  # the probability that 0 is taken for
+LEAST = 1e-12  # the probability that 0 is taken for: one sure mistake must not decide alone
 _SHARE = 0.95  # of the still clips that a fitted threshold rejects, and of the actions that it keeps at least
 _PRIOR = 0.5  # deviation of log temperature before any video is seen
 _RANGE = (-3.0, 3.0)  # of log temperature
@@ -41,13 +41,18 @@ class Confidence:
         >>> Confidence(temperature=2.0).of(np.array([0.9, 0.1])).round(2).tolist()
         [0.75, 0.25]
         """
-        logits = np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None)) / self.temperature
+        logits = log_probabilities(scores) / self.temperature
         powers = np.exp(logits - logits.max(-1, keepdims=True))
         return powers / powers.sum(-1, keepdims=True)
 
     def notes(self) -> dict[str, Any]:
         """Returns the fields by name, as the notes of a weights file hold them."""
         return asdict(self)
+
+
+def log_probabilities(scores: np.ndarray) -> np.ndarray:
+    """Returns the logarithms f64 of probabilities of any shape, of 0 that of 1e-12."""
+    return np.log(np.clip(np.asarray(scores, np.float64), LEAST, None))
 
 
 def stored_confidence(notes: dict[str, Any]) -> Confidence | None:
@@ -113,13 +118,12 @@ def fit_confidence(scores: np.ndarray, labels: np.ndarray, still: np.ndarray, so
 
 def _fit_temperature(scores: np.ndarray, labels: np.ndarray) -> float:
     from scipy.optimize import minimize_scalar
+    from scipy.special import logsumexp
 
-    logits = np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
+    logits = log_probabilities(scores)
     true = logits[np.arange(len(labels)), labels]
 
     def loss(log_temperature: float) -> float:
-        from scipy.special import logsumexp
-
         sharp = np.exp(-log_temperature)
         likelihood = (sharp * true - logsumexp(sharp * logits, axis=-1)).sum()
         return float(log_temperature**2 / (2 * _PRIOR**2) - likelihood)

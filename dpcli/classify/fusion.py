@@ -1,4 +1,4 @@
-"""The fusion of several models' scores: their weighted mean, and the weights that suit labeled videos best (thesis A.1.5).
+"""The fusion of several models' scores: their weighted mean (thesis A.2.1), and the weights that suit labeled videos best.
 
 Arithmetic as the thesis writes it, or geometric, which is the mean of logits that the published code takes.
 """
@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dpcli.classify.confidence import LEAST, log_probabilities
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 
 MEANS = ("arithmetic", "geometric")
 _STEPS = 10_000  # of expectation-maximization; some hundred are usual
 _POWER = 100.0  # scores are taken to no higher power: where every model is right, none would be high enough
-_LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
 def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -> np.ndarray:
@@ -64,11 +64,7 @@ def mean_scores(scores: np.ndarray, weights: np.ndarray, mean: str) -> np.ndarra
         return np.sort(scores * weights[:, None, None], axis=0).sum(0)
     from scipy.special import softmax
 
-    return softmax(np.sort(_logits(scores) * weights[:, None, None], axis=0).sum(0), -1)
-
-
-def _logits(scores: np.ndarray) -> np.ndarray:
-    return np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
+    return softmax(np.sort(log_probabilities(scores) * weights[:, None, None], axis=0).sum(0), -1)
 
 
 def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -80,7 +76,7 @@ def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
     from scipy.optimize import minimize
     from scipy.special import logsumexp, softmax
 
-    logits = _logits(scores)
+    logits = log_probabilities(scores)
     true = logits[:, np.arange(len(labels)), labels]  # (K,S)
 
     def loss(powers: np.ndarray) -> tuple[float, np.ndarray]:
@@ -100,7 +96,7 @@ def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
     probabilities: (K,S), what each of K models gives the true class of each sample. The logarithm of the likelihood, sum_s log
     sum_k w_k p_ks, is concave in w, so expectation-maximization from equal weights ends at its maximum.
     """
-    found = np.clip(np.asarray(probabilities, np.float64), _LEAST, None)
+    found = np.clip(np.asarray(probabilities, np.float64), LEAST, None)
     weights = np.full(len(found), 1 / len(found))
     for _ in range(_STEPS):
         shares = weights[:, None] * found

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from dpcli.classify.network.backbones.interface import Stage
+from dpcli.classify.network.backbones.interface import Grouping, Stage
 from dpcli.classify.network.kinematic import Kinematics
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network_speed import body_like_clip, latency, steps
@@ -26,32 +26,41 @@ def count_parameters(module: nn.Module) -> int:
 
 def paper_parameters(module: nn.Module) -> float:
     """Returns millions as the thesis's table A.1 counts: weights, both Adam moments and batch norm's moving statistics, over 2^20."""
-    moving = sum(b.numel() for name, b in module.named_buffers() if "running" in name)
-    return (3 * count_parameters(module) + moving) / 2**20
+    return (3 * count_parameters(module) + _moving_statistics(module)) / 2**20
+
+
+def _moving_statistics(module: nn.Module) -> int:
+    return sum(buffer.numel() for name, buffer in module.named_buffers() if "running" in name)
 
 
 def _paper_total(model: Kinet) -> float:
     """Returns both streams counted that way: a frozen static stream has no moments, and is counted once."""
-    frozen = count_parameters(model.static) + sum(
-        b.numel() for name, b in model.static.named_buffers() if "running" in name
-    )
+    frozen = count_parameters(model.static) + _moving_statistics(model.static)
     return paper_parameters(model.dynamic) + frozen / 2**20
 
 
 def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
     """Returns multiply-adds of the matrix products of one clip (B=1), by stream, and of the fits (counted by hand).
 
-    Neighbor search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`.
+    Neighbor search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`. Where the
+    static stream has neighborhoods of its own, its layers' second pass, at the dynamic stream's, is the dynamic stream's.
     """
+    groups = model.group(points)
+    stages, both = _tapped(model, groups)
+    own = groups[: len(groups) // 2] if model.config.own_static_groups else groups  # they come first
+    static = both if own is groups else _tapped(model, own)[1]
+    written = getattr(model.static, "macs_as_written", lambda: static)()
+    dynamic = both - static + _linear_macs(model.dynamic, stages) + _fit_macs(model, stages)
+    return {"static": static, "static_as_written": written, "dynamic": dynamic, "total": static + dynamic}
+
+
+def _tapped(model: Kinet, groups: list[Grouping]) -> tuple[list[Stage], int]:
+    """Returns what the dynamic stream reads of the static network, and the multiply-adds that it takes."""
     from torch.utils.flop_counter import FlopCounterMode
 
-    groups = model.group(points)
     with torch.no_grad(), reference_only(), FlopCounterMode(display=False) as counter:
         stages, _ = model.static.taps(groups)
-    static = counter.get_total_flops() // 2
-    written = getattr(model.static, "macs_as_written", lambda: static)()
-    dynamic = _linear_macs(model.dynamic, stages) + _fit_macs(model, stages)
-    return {"static": static, "static_as_written": written, "dynamic": dynamic, "total": static + dynamic}
+    return stages, counter.get_total_flops() // 2
 
 
 def _linear_macs(dynamic: Kinematics, stages: list[Stage]) -> int:
@@ -92,7 +101,6 @@ def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dic
     points = body_like_clip(config.num_frames, config.points_per_frame).to(device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    before = peak_memory()
     counts = macs(model, points)
     result = {
         "variant": config.variant,
@@ -120,7 +128,7 @@ def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dic
         },
         "uncounted": "neighbor search, batch norm, activations, pooling, the small inverses",
         "latency_ms": latency(model, points, device),
-        "peak_memory_mb": _peak(device, before),
+        "peak_memory_mb": _peak(device),
         "device": str(device),
         "threads": torch.get_num_threads(),
     }
@@ -129,10 +137,10 @@ def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dic
     return result
 
 
-def _peak(device: torch.device, before: int) -> float:
+def _peak(device: torch.device) -> float:
     if device.type == "cuda":
         return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
-    return round(max(peak_memory(), before) / 2**20, 1)
+    return round(peak_memory() / 2**20, 1)
 
 
 def render(result: dict[str, Any]) -> str:

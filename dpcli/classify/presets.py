@@ -101,22 +101,14 @@ VARIANT_CHANGES: dict[str, dict[str, Any]] = {
     for name, config in (("thesis", KinetConfig()), ("release", KinetConfig.release()))
 }
 
-_GRAPH = {
-    "neighbors": 20,
-    "grouping": "balanced",
-    "merge": "residual",
-    "static_temporal_radius": None,
-}  # the release's merge pairs PointNet++'s two stages, as two sets of neighborhoods do
+# the release's merge pairs PointNet++'s two stages, as two sets of neighborhoods do
+_GRAPH = {"neighbors": 20, "grouping": "balanced", "merge": "residual", "static_temporal_radius": None}
 _FULL = {**_GRAPH, "head": (512, 1024), "points_per_frame": 128}
 _DGCNN = {**_FULL, "widths": ((64, 64, 64, 128), (1024,), (64, 128, 1024, 512, 256), (512, 256)), "dropout": 0.5}
 _SPIDER = {**_FULL, "widths": ((32, 64, 128, 256), (5,), (1024, 512)), "dropout": 0.7}
 _QUICK = {**_GRAPH, "head": (128, 512), "points_per_frame": 128, "reduction": 1.0}  # narrow layers: nothing to reduce
-_TINIER = {
-    **_GRAPH,
-    "head": (64, 128),
-    "neighbors": 12,
-    "points_per_frame": 96,
-}  # with 32 the dynamic stream stayed at chance
+# with 32 points a frame the dynamic stream stayed at chance
+_TINIER = {**_GRAPH, "head": (64, 128), "neighbors": 12, "points_per_frame": 96}
 
 # What a preset's configuration changes for a backbone whose vertices are all points of a clip: published sizes and as many
 # points as the multiply-adds of table A.1 imply, or narrower and fewer where a CPU trains.

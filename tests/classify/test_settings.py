@@ -115,6 +115,9 @@ def test_pretraining_is_one_frame_and_no_dynamic_stage():
         ({"video_loss": True, "clips_per_video": 1}, "video_loss = true with clips_per_video = 1: expected two clips"),
         ({"neighbors": 2}, "temporal_radius = 1: balanced grouping shares 2 neighbors among 3 frames"),
         ({"backbone": "dgcnn", "static_temporal_radius": 0}, "dgcnn's one graph serves both streams"),
+        ({"members": 4}, "members = 4: only the backbone slots has it"),  # or `cross` would judge by videos learned
+        ({"copies": True}, "copies = true: only the backbone slots has it"),
+        ({"slot_details": True}, "slot_details = true: only the backbone slots has it"),
     ],
 )
 def test_settings_that_contradict_end_with_a_sentence(typed, sentence):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -175,5 +176,5 @@ def _score_videos(
 
 def _worthwhile_processes(source: ClipSource, work: ScoreVideo) -> int:
     """Returns how many processes are worthwhile: one for each core where the work takes longer than starting them, else one."""
-    clips = sum(len(source.video_clips(sequence, work.clips_per_video)) for sequence in source.sequences)
-    return cpu_count() if work.device == "cpu" and clips > _WORTH_WORKERS else 1
+    clips = accumulate(len(source.video_clips(sequence, work.clips_per_video)) for sequence in source.sequences)
+    return cpu_count() if work.device == "cpu" and any(so_far > _WORTH_WORKERS for so_far in clips) else 1

@@ -17,7 +17,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
 from dpcli.classify.stream.sliding_window import StreamPredictor, window_size
-from dpcli.counted import counted as numbered
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
@@ -79,7 +79,7 @@ def _tell_odd(reader: CloudsReader, chosen: Sequence[int], info: ModelInfo, wind
     short = [reader.names[i] for i in chosen if reader.frame_counts[i] < window]
     if short:
         log.info(
-            f"{numbered(len(short), 'recording')} of fewer than {numbered(window, 'frame')}, a window, so one segment each:"
+            f"{counted(len(short), 'recording')} of fewer than {counted(window, 'frame')}, a window, so one segment each:"
             f" {first_names(short)}"
         )
     if info.timing != "slots":
@@ -148,7 +148,7 @@ def _record(weights: Path, info: ModelInfo, how: Cutting, task: ModelTask) -> di
     }
 
 
-def counted(recordings: dict[str, list[Segment]]) -> tuple[int, int]:
+def segment_counts(recordings: dict[str, list[Segment]]) -> tuple[int, int]:
     """Returns how many segments show an action, and how many nothing."""
     names = [one.name for own in recordings.values() for one in own]
     return sum(map(bool, names)), names.count("")

@@ -68,7 +68,7 @@ class Training:
     """
 
     weights: Path
-    videos: int  # for validation
+    videos: int  # that validated; those too short for a clip may be left out
     accuracy: dict[str, float]
     caveat: str = ""
     forest: float | None = None
@@ -142,19 +142,14 @@ def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
         _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
         base = settings_from(info, reader, values.get("fine_tune"))
         return training_settings(_without_part(given), base)
-    preset = preset_for(reader, given.values)
-    settings = training_settings(_with_preset(given, preset))
+    preset = preset_for(reader, given.values) if given.preset == AUTO else given.preset
+    settings = training_settings(replace(given, preset=preset))
     if given.preset == AUTO and preset == "long":
         log.info(
             f"preset long: the median video has {counted(int(np.median(reader.frame_counts)), 'frame')}, four clips of"
             f" {settings.network.num_frames} or more; clips of a video are judged together (--preset quick: each for itself)"
         )
     return replace(settings, schedule=resolved(settings.schedule, reader))
-
-
-def _with_preset(given: Given, preset: str) -> Given:
-    """Returns what was given with a preset in place of `auto`."""
-    return replace(given, preset=preset) if given.preset == AUTO else given
 
 
 def _train(
@@ -171,17 +166,16 @@ def _train(
     schedule.share(processes.count)
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
-    report_short(videos.training, settings.network.num_frames)
+    for source in filter(None, (videos.training, videos.validation)):
+        report_short(source, settings.network.num_frames)
     report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, videos, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, seed))
     _announce(device, processes, videos, settings)
     keep_freed_memory()
-    with (
-        folder if processes.first else nullcontext(),
-        stop_requested() as stop,
-    ):  # last: --force deletes an earlier model
+    # last: --force deletes an earlier model
+    with folder if processes.first else nullcontext(), stop_requested() as stop:
         if processes.first:
             folder.write_settings(settings.to_toml(f"classify train --seed {seed}"))
         processes.wait()  # the others find the folder as it is to be
@@ -196,7 +190,8 @@ def _train(
     accuracy = trainer.validate() if videos.validation is not None else {}
     if not processes.first:
         return None
-    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy, videos.caveat, _forest(videos, seed))
+    judged = len(videos.validation.sequences) if videos.validation is not None else 0
+    return Training(folder.file("best.safetensors"), judged, accuracy, videos.caveat, _forest(videos, seed))
 
 
 def _forest(videos: _Videos, seed: int) -> float | None:
@@ -300,7 +295,7 @@ def _notes(videos: _Videos, seed: int) -> dict[str, Any]:
         "data": videos.digest,
         "seed": seed,
         "validation": videos.rule,
-        "trained_on": f"{counted(videos.counts[0], 'video')}",
+        "trained_on": counted(videos.counts[0], "video"),
         NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }

@@ -204,7 +204,8 @@ class ClipSource:
 
     def _slots(self, clip: Clip, rng: np.random.Generator) -> np.ndarray:
         config, number = self.config, clip.sequence
-        whole = clip.frames == tuple(range(int(self.reader.frame_counts[number])))
+        length = int(self.reader.frame_counts[number])  # of a stream ever more, so that no list is made of it
+        whole = len(clip.frames) == length and clip.frames == tuple(range(length))
         rows = self._rows.get(number) if whole else None
         if rows is None:
             fields = tuple(map(kept_name, config.columns))

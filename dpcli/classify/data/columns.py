@@ -15,7 +15,7 @@ from dpcli.classify.network.descriptors import SLOTS
 from dpcli.store import CloudsReader
 from dpcli.store.schema import KEPT, kept_name
 
-_LOOKED_AT = 2000  # videos at most, evenly over the file
+_LOOKED_AT, _POINTS = 2000, 10_000_000  # videos and, about, points at most, evenly over the file
 _MOST = 0.9  # of frames, or of steps between them, for which a rule must hold: counters wrap, clocks stop
 _STEPS = 20  # between frames, or points of a video, at least, before they tell a rule
 _ENOUGH = 8  # videos a class: in fewer, chance can hide what a column says
@@ -49,7 +49,8 @@ def telling_columns(
     names = file_columns(reader)
     if not names or not len(sequences):
         return names, {}
-    some = list(sequences)[:: -(-len(sequences) // _LOOKED_AT)]
+    points = int(reader.frame_sizes.sum()) * len(sequences) // len(reader)
+    some = list(sequences)[:: max(-(-len(sequences) // _LOOKED_AT), -(-points // _POINTS))]
     labels = reader.labels[some] if by_class else None
     columns = _columns(reader, some, names)
     found = {name: _why_not(columns[name], labels) for name in names}
@@ -62,6 +63,7 @@ def not_read(left_out: dict[str, str]) -> str:
 
 
 def _columns(reader: CloudsReader, sequences: Sequence[int], names: tuple[str, ...]) -> dict[str, list[_Video]]:
+    """Returns some videos by column; columns without missing values share all but these."""
     found: dict[str, list[_Video]] = {name: [] for name in names}
     for number in sequences:
         video = reader.read(number, fields=tuple(map(kept_name, names)))
@@ -71,7 +73,8 @@ def _columns(reader: CloudsReader, sequences: Sequence[int], names: tuple[str, .
         for name in names:
             values = video.extra[kept_name(name)].astype(np.float64)
             good = np.isfinite(values)
-            found[name].append(_Video(values[good], frames[good], rows[good], video.points[good], video.num_frames))
+            own = (values, frames, rows, video.points)
+            found[name].append(_Video(*(own if good.all() else (part[good] for part in own)), video.num_frames))
     return found
 
 
@@ -148,13 +151,15 @@ def _by_chance(videos: list[_Video], labels: np.ndarray) -> bool:
     ranks = rankdata(np.concatenate([one.values for one in videos]))
     parts = np.split(ranks / len(ranks) - 0.5, np.cumsum([len(one.values) for one in videos])[:-1])
     means = np.stack([_means(own, one) for own, one in zip(parts, videos)])
+    means = means[:, np.isfinite(means).any(0)]  # videos of few frames leave slots empty
     means = np.where(np.isnan(means), np.nanmean(means, 0), means)
     means = means[:, np.ptp(means, 0) > 0]
     with_place = np.stack([_with_place(own, one) for own, one in zip(parts, videos)])
-    chances = [
-        *f_oneway(*(means[labels == one] for one in classes)).pvalue,
-        *np.nan_to_num(ttest_1samp(with_place, 0, nan_policy="omit").pvalue, nan=1.0),
-    ]
+    by_place = np.full(with_place.shape[1], np.nan)
+    known = np.isfinite(with_place).sum(0) > 1
+    if known.any():
+        by_place[known] = ttest_1samp(with_place[:, known], 0, nan_policy="omit").pvalue
+    chances = [*f_oneway(*(means[labels == one] for one in classes)).pvalue, *np.nan_to_num(by_place, nan=1.0)]
     return bool(min(chances) * len(chances) > _CHANCE)
 
 

@@ -25,9 +25,8 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
         sequence = CloudSequence.from_frames(sequence.name, [np.zeros((1, 3), np.float32)])
     times = np.repeat(np.arange(sequence.num_frames), np.diff(sequence.frame_offsets))
     middle = np.median(sequence.points, 0)
-    columns = [sequence.extra[name] for name in fields if name in sequence.extra]
-    missing = [np.zeros(len(times))] * (len(fields) - len(columns))
-    values = np.column_stack([sequence.points - middle, *columns, *missing]).astype(np.float64)
+    columns = [sequence.extra.get(name, np.zeros(len(times))) for name in fields]
+    values = np.column_stack([sequence.points - middle, *columns]).astype(np.float64)
     size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
     found = np.concatenate([size, described(values, times * SLOTS // max(sequence.num_frames, 1))])
     return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)

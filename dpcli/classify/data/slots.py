@@ -24,6 +24,7 @@ _EXTREME = 3.0  # spreads: a column's value beyond counts as being there
 _FAST, _SLOWEST = 0.8, 0.1  # the quantile that is a video's level, which is about 1 spread; the least level
 _LEAST = 4  # points that random changes leave of a video
 _BOTH_SIGNS = 0.1  # of a column's values at least above and below 0: it is a speed, and 0 its middle
+_NO_SPEED = 1e-30  # the middle of another column that is 0 most of the time
 
 
 SPARSE = 64  # points of a frame in the median, at most: what common radars send
@@ -81,7 +82,7 @@ def measured_scales(reader: CloudsReader, sequences: list[int], columns: tuple[s
         values = values[np.isfinite(values)]
         low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]) if len(values) else (0.0, 0.0, 0.0)
         signed = min((values < 0).mean(), (values > 0).mean()) >= _BOTH_SIGNS if len(values) else False
-        found += [0.0 if signed else float(middle), float(high - low) / 2]
+        found += [0.0 if signed else float(middle) or _NO_SPEED, float(high - low) / 2]
     units = [value if place % 2 or value > 1e-9 else 1.0 for place, value in enumerate(found)]
     return tuple(float(value) for value in units)
 

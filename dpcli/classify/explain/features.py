@@ -1,6 +1,6 @@
 """The places where explanations look into a network: the features of a stage's centroids, and the vector before the last layer.
 
-Forward hooks find both in any backbone, so none has to offer more than the three methods of `classify.backbone`.
+Forward hooks find both in any backbone, so none has to offer more than the three methods of `network/backbones/interface.py`.
 """
 
 from __future__ import annotations

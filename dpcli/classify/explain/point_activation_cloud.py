@@ -9,6 +9,7 @@ gradient with respect to channel k of the last stage's features f.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,10 +19,9 @@ from dpcli.classify.data.clips import Clip, ClipSource, normalize
 from dpcli.classify.explain.features import Layer, stage_layer
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import STREAMS, Kinet, fuse
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.store import CloudSequence
 
-RULES = ("activation", "gradient")
 _LEAST = 1e-10  # squared distances are clamped to this, so that a coincident point takes all the weight
 _ROWS = 4096  # points at a time
 _FIRST = {"activation": 0, "gradient": None}  # the stage looked at by default; None: the last
@@ -32,13 +32,9 @@ class Question:
     """Says what is asked of a clip. rule: activation or gradient; stage: 0 the first, None the rule's own;
     target: predicted, label or a class's number, for the rule gradient."""
 
-    rule: str = "activation"
+    rule: Literal["activation", "gradient"] = "activation"
     stage: int | None = None
     target: str | int = "predicted"
-
-    def __post_init__(self) -> None:
-        if self.rule not in RULES:
-            raise UsageError(f"rule = {self.rule}: expected {' or '.join(RULES)}")
 
 
 @dataclass

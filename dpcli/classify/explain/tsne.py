@@ -6,6 +6,8 @@ beside the picture, the leave-one-out accuracy of the five nearest neighbors and
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -22,6 +24,7 @@ from dpcli.runtime.signals import stop_requested
 NEIGHBORS = 5
 _PERPLEXITY = 30.0  # by default, and less where there are few videos
 _FEWEST = 4  # videos
+_ROWS = 256  # videos whose distances from all others are held at once
 
 
 def video_features(
@@ -90,13 +93,9 @@ def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
         init="pca",
         learning_rate="auto",
         random_state=scikit_learn_state(seed),
-        method=_method(len(features)),
+        method="exact" if len(features) < 500 else "barnes_hut",
     )
     return fit.fit_transform(scaled.astype(np.float64)).astype(np.float32)
-
-
-def _method(videos: int) -> str:
-    return "exact" if videos < 500 else "barnes_hut"
 
 
 def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBORS) -> float | None:
@@ -109,10 +108,18 @@ def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBO
     vectors, truth = features[known].astype(np.float64), labels[known]
     if len(truth) < 2 or len(np.unique(truth)) < 2:
         return None
-    distance = _distances(vectors)
-    np.fill_diagonal(distance, np.inf)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, : min(k, len(truth) - 1)]
+    nearest = _nearest(vectors, min(k, len(truth) - 1))
     return float(np.mean([_vote(truth[row]) == own for row, own in zip(nearest, truth)]))
+
+
+def _nearest(vectors: np.ndarray, k: int) -> Iterator[np.ndarray]:
+    """Yields the indices of the k nearest others of each vector, some rows of distances in memory at a time."""
+    from scipy.spatial.distance import cdist
+
+    for start in range(0, len(vectors), _ROWS):
+        distance = cdist(vectors[start : start + _ROWS], vectors)
+        distance[np.arange(len(distance)), start + np.arange(len(distance))] = np.inf
+        yield from np.argsort(distance, axis=1, kind="stable")[:, :k]
 
 
 def _vote(labels: np.ndarray) -> int:
@@ -120,12 +127,6 @@ def _vote(labels: np.ndarray) -> int:
     values, first, counts = np.unique(labels, return_index=True, return_counts=True)
     best = counts == counts.max()
     return int(values[best][first[best].argmin()])
-
-
-def _distances(vectors: np.ndarray) -> np.ndarray:
-    from scipy.spatial.distance import cdist
-
-    return cdist(vectors, vectors)
 
 
 def silhouette(features: np.ndarray, labels: np.ndarray) -> float | None:

@@ -123,10 +123,8 @@ class KinetConfig:
         " all of them alone (backbone slots).",
     )
     columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
-    forest: tuple[int, int] = (
-        0,
-        0,
-    )  # trees and nodes of a tree beside each member of the backbone slots, grown from the data
+    # trees and nodes of a tree beside each member of the backbone slots, grown from the data
+    forest: tuple[int, int] = (0, 0)
     scales: tuple[float, ...] = ()  # unit of length, then middle and spread of each column; follow from the data
 
     def __post_init__(self) -> None:
@@ -140,6 +138,12 @@ class KinetConfig:
         if self.backbone == "slots":
             self._check_columns()
             return
+        for name, plain in (("members", 1), ("copies", False), ("slot_details", False)):
+            if getattr(self, name) != plain:
+                raise UsageError(
+                    f"{name} = {str(getattr(self, name)).lower()}: only the backbone slots has it; leave it out, or take --preset"
+                    " sparse"
+                )
         if self.backbone == "pointnet2":
             self._check_centroids()
         if self.xyz_group and self.group_size < 3:

@@ -37,7 +37,7 @@ class Forest(nn.Module):
                 (made.left, tree.children_left),
                 (made.right, tree.children_right),
                 (made.label, names),
-                (made.largest, tree.threshold),
+                (made.largest, _float32_below(tree.threshold)),
             ):
                 buffer[number, :count] = torch.from_numpy(np.asarray(values)).to(buffer.dtype)
         return made
@@ -57,3 +57,9 @@ class Forest(nn.Module):
             at = torch.where(inner, child.long().clamp(0, nodes - 1), at)
         votes = nn.functional.one_hot(self.label.gather(1, at).long().clamp(0, self.classes - 1), self.classes)
         return (votes.sum(0) + 1) / (trees + self.classes)
+
+
+def _float32_below(thresholds: np.ndarray) -> np.ndarray:
+    """Returns the largest float32 not above each threshold f64: the same float32 descriptors are at most as large as either."""
+    rounded = thresholds.astype(np.float32)
+    return np.where(rounded > thresholds, np.nextafter(rounded, np.float32(-np.inf)), rounded)

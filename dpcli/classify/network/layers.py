@@ -1,14 +1,32 @@
-"""Layers that the networks of this room share: linear layers over neighborhoods, the head of a clip, the initialization."""
+"""Layers that the networks of this room share: norms, linear layers over neighborhoods, the head of a clip, the initialization."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
+from torch.nn.functional import batch_norm, linear
 
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.ops import gather_points
 from dpcli.ops.grouped_mlp import Norm, grouped_mlp
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Normalizes as a BatchNorm1d; a single row, which has no statistics, as outside of training."""
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Returns rows (R,C) normalized."""
+        if len(rows) > 1:
+            return super().forward(rows)
+        return batch_norm(rows, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps)
+
+
+@torch.no_grad()
+def remember(norm: nn.BatchNorm1d, mean: Tensor, var: Tensor, rows: int) -> None:
+    """Updates running statistics as BatchNorm1d does, from the mean and biased variance of so many rows."""
+    norm.num_batches_tracked += 1
+    norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
+    norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
 
 
 class SharedLayers(nn.Module):
@@ -35,7 +53,8 @@ class SharedLayers(nn.Module):
             return self._pool_together(points, centers, idx, features)
         pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
         if self.training:
-            self._update(statistics, idx.numel())
+            for norm, mean, var in zip((self.norm1, self.norm2), statistics[::2], statistics[1::2]):
+                remember(norm, mean, var, idx.numel())
         return pooled
 
     def _pool_together(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
@@ -45,13 +64,6 @@ class SharedLayers(nn.Module):
             values = torch.cat([values, gather_points(features, idx)], -1)
         hidden = torch.relu(self.norm1(self.linear1(values.flatten(0, 2))))
         return torch.relu(self.norm2(self.linear2(hidden))).view(*idx.shape, -1).amax(2)
-
-    def _update(self, statistics: list[Tensor], rows: int) -> None:
-        with torch.no_grad():
-            for norm, mean, var in zip((self.norm1, self.norm2), statistics[::2], statistics[1::2]):
-                norm.num_batches_tracked += 1
-                norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
-                norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
 
 
 class ClipLinear(nn.Linear):

@@ -69,8 +69,10 @@ def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, Mo
     if len(names) != config.num_classes or not all(map(_is_text, names)):
         raise DataError(f"{path}: class_names = {names!r:.80}, expected {config.num_classes} names; copy it again")
     streams = notes.get("streams", list(STREAMS))
-    if streams not in (list(STREAMS), *([one] for one in STREAMS)):
-        raise DataError(f"{path}: streams = {streams!r:.80} in its notes, expected some of {', '.join(STREAMS)}")
+    if streams not in (list(STREAMS), ["static"]):
+        raise DataError(
+            f"{path}: streams = {streams!r:.80} in its notes, expected {', '.join(STREAMS)} or static alone"
+        )
     network = fill_network(lambda: Kinet(config), tensors, path)
     return network, ModelInfo(config, names, timing, notes)
 

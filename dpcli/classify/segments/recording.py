@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.classify.confidence import Confidence
+from dpcli.classify.confidence import Confidence, log_probabilities
 from dpcli.classify.segments.decoding import best_path, runs
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.runtime.progress import Progress
@@ -75,7 +75,7 @@ def cut(found: WindowScores, class_names: Sequence[str], how: Cutting) -> list[S
     competes as a class whose probability is always the threshold.
     """
     probabilities = how.confidence.of(found.scores)
-    evidence = np.log(np.maximum(probabilities, 1e-12))
+    evidence = log_probabilities(probabilities)
     nothing = np.log(how.confidence.threshold) if how.confidence.threshold > 0 else -np.inf
     evidence = np.column_stack([evidence, np.full(len(evidence), nothing)])
     least = max(1, -(-how.shortest // how.hop))  # steps of a hop each

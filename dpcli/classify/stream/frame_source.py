@@ -187,20 +187,29 @@ def without_padding(points: np.ndarray) -> np.ndarray:
 
 
 def _folder_frames(folder: Path, follow: float, files: CloudFiles, columns: tuple[str, ...]) -> Iterator[np.ndarray]:
-    """Yields files in name order, the newest once it has settled; ends when none came for `follow` seconds."""
-    taken, last, since, told = 0, None, time.monotonic(), False
+    """Yields files in name order, the newest once it has settled; ends when none came for `follow` seconds.
+
+    A look costs what is new, since a folder of a day of frames is looked at as often as one of a minute.
+    """
+    known: set[str] = set()  # names of files that were taken or left out
+    last, since, told = None, time.monotonic(), False
     while True:
-        paths = [p for p in folder.iterdir() if p.suffix.lower() in files.suffixes and not p.name.startswith(".")]
+        with os.scandir(folder) as entries:
+            paths = [Path(entry.path) for entry in entries if entry.name not in known]
+        paths = [path for path in paths if path.suffix.lower() in files.suffixes and not path.name.startswith(".")]
         keyed = sorted((files.order(path), path) for path in paths)
         fresh = [pair for pair in keyed if last is None or pair[0] > last]
-        if len(keyed) - len(fresh) > taken and not told:
+        late = [path.name for key, path in keyed if last is not None and key <= last]
+        if late and not told:
             log.warn(f"{folder}: a file came after its successor by name and is left out; names must rise")
             told = True
+        known.update(late)
         for position, (key, path) in enumerate(fresh):
             if position == len(fresh) - 1 and not _settled(path, since + follow):
                 break
             yield as_frame(files.read(path, columns), str(path))
-            taken, last, since = taken + 1, key, time.monotonic()
+            known.add(path.name)
+            last, since = key, time.monotonic()
         if not fresh and time.monotonic() - since >= follow:
             return
         time.sleep(_POLL)

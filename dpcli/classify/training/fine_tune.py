@@ -27,7 +27,7 @@ _RATE = 6e-3  # of heads and last layers: at a sixth of it the dynamic stream la
 _EPOCHS = 5, 100  # at least, at most, of what is frozen but for its last layers
 _SHORTEST = 4  # where everything learns: this part of the epochs of a training from nothing, at least
 _UNIT = 2.0  # times as large or small as what a network learned from: another unit
-_LOOKED_AT = 50  # videos
+_LOOKED_AT = 50  # videos at most, evenly over those for training: files are often in the order of their classes
 _TELLING = 16  # points of a frame that tell how tall a body is, at least
 
 
@@ -82,7 +82,8 @@ def _in_its_unit(config: KinetConfig, reader: CloudsReader) -> KinetConfig:
     """
     if config.normalize != "center":
         return config
-    deviation = _deviation(reader, labeled(reader, "train")[:_LOOKED_AT])
+    videos = labeled(reader, "train")
+    deviation = _deviation(reader, videos[:: -(-len(videos) // _LOOKED_AT)])
     if deviation is None or DEVIATION / _UNIT < deviation < DEVIATION * _UNIT:
         return config
     log.warn(
@@ -121,11 +122,13 @@ def freeze(branch: nn.Module, part: str) -> None:
 
 
 def train_mode(branch: nn.Module, part: str) -> None:
-    """Sets what learns to training mode, and the rest, batch norms above all, to evaluation mode."""
+    """Sets what learns to training mode, and the rest, batch norms above all, to evaluation mode.
+
+    The branch itself trains whatever learns of it: `PointSlots` then chooses the members that may learn from a clip.
+    """
     branch.train()
-    if part != "all":
-        for name, module in branch.named_modules():
-            module.training = _learns(name, part)
+    for name, module in branch.named_modules():
+        module.training = not name or _learns(name, part)
 
 
 def _learns(module: str, part: str) -> bool:

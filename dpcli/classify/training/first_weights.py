@@ -26,7 +26,7 @@ def take_weights(
     shared = {k: their_names.index(name) for k, name in enumerate(class_names) if name in their_names}
     taken: dict[str, Tensor] = {}
     for key, value in own.items():
-        other = others.get(key)
+        other = None if _is_grown(key) else others.get(key)
         if other is not None and _CLASSIFIER in key.split("."):
             other = _by_class(value, other, shared, (len(class_names), len(their_names)))
         if other is not None and other.shape == value.shape:

@@ -123,9 +123,8 @@ def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -
     unused |= config.members > 1  # a few clips may leave one of them without any
     where = [device.index] if device.type == "cuda" else None
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", FutureWarning
-        )  # torch 2.13 renames broadcast_buffers, earlier ones know no other
+        # torch 2.13 renames broadcast_buffers, earlier ones know no other
+        warnings.simplefilter("ignore", FutureWarning)
         return nn.parallel.DistributedDataParallel(
             module, device_ids=where, broadcast_buffers=False, find_unused_parameters=unused
         )

@@ -76,9 +76,8 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Returns the validation videos' accuracy by stream, fused once both streams are trained."""
-        static_only = (
-            self.stage == 0 or not self.schedule.epochs_dynamic
-        )  # the dynamic stream is not trained yet, or never
+        # the dynamic stream is not trained yet, or never
+        static_only = self.stage == 0 or not self.schedule.epochs_dynamic
         streams = STREAMS[:1] if static_only else (*STREAMS, "fused")
         return validation_accuracy(self.model, self.validation, self.schedule, self.processes, self.device, streams)
 

@@ -42,15 +42,15 @@ def predict_segments(
     if hop is not None and hop < 1:
         raise UsageError(f"--hop {hop}: expected at least 1 frame")
     from dpcli.classify.commands.segments import SegmentOptions as Options
-    from dpcli.classify.commands.segments import counted
     from dpcli.classify.commands.segments import predict_segments as run
-    from dpcli.counted import counted as number
+    from dpcli.classify.commands.segments import segment_counts
+    from dpcli.counted import counted
 
     found, text = run(task, Options(hop, window, shortest, reject))
     if task.output == "-":
         typer.echo(text, nl=False)
         return
-    actions, nothing = counted(found.recordings)
-    stretches = number(nothing, "stretch of nothing", "stretches of nothing")
-    recordings = number(len(found.recordings), "recording")
-    typer.echo(f"{task.output}: {number(actions, 'action')} and {stretches} in {recordings}")
+    actions, nothing = segment_counts(found.recordings)
+    stretches = counted(nothing, "stretch of nothing", "stretches of nothing")
+    recordings = counted(len(found.recordings), "recording")
+    typer.echo(f"{task.output}: {counted(actions, 'action')} and {stretches} in {recordings}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 
 import numpy as np
@@ -143,22 +142,23 @@ def test_videos_without_points_or_with_odd_numbers_are_described():
     assert len(found) == len(descriptor(CloudSequence.from_frames("v", [odd]), ()))
 
 
-def test_training_tells_the_forest_beside_the_network(tmp_path):
+def test_training_tells_the_forest_beside_the_network(tmp_path, capsys):
     data = write(tmp_path / "a.h5", videos=12)
     few = "--epochs 1 --set epochs_dynamic=1 --preset tiny --frames 4 --points 64 --validation 0.25".split()
-    told = subprocess.check_output(
-        [sys.executable, "-m", "dpcli", "classify", "train", data, "-o", tmp_path / "run", *few], text=True
-    ).splitlines()
+    assert exit_code("classify", "train", data, "-o", tmp_path / "run", *few) == 0
+    told = capsys.readouterr().out.splitlines()
     assert told[1].startswith("6 validation videos: static ")
     assert told[2].startswith("a random forest on hand-made descriptors: ") and told[2].split()[6] in ("83.3", "100.0")
     assert told[3].startswith("note: 2 people train and validate")
 
 
-def test_the_command_reads_a_pipe_and_prints_one_line(tmp_path):
+def test_the_command_reads_stdin_and_prints_one_line(tmp_path, monkeypatch, capsys):
     data = write(tmp_path / "a.h5")
-    words = [sys.executable, "-m", "dpcli", "classify", "baseline", "-"]
-    with open(data, "rb") as file:
-        told = subprocess.run(words, stdin=file, capture_output=True, text=True, check=True).stdout
+    with open(data) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert exit_code("classify", "baseline", "-") == 0
+    told = capsys.readouterr().out
     assert told.startswith("forest: ") and told.count("\n") == 1 and "of 6 videos, 3 classes" in told
-    found = json.loads(subprocess.check_output([*words[:-1], data, "--json"]))
+    assert exit_code("classify", "baseline", data, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
     assert found["judged"] == 6 and found["accuracy"] == found["right"] / 6

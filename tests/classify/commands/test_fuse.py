@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from dpcli.cli.app import app
 from dpcli.cli.classify.fuse import fuse as fuse_files
 from dpcli.errors import DataError, UsageError
 from dpcli.store import ScoresReader, ScoresWriter
+from tests.support.commands import exit_code
 
 CLASSES = ["push", "wave", "bend"]
 POINTS = {"v0": (0, [0.6, 0.3, 0.1]), "v1": (1, [0.5, 0.4, 0.1]), "v2": (2, [0.2, 0.2, 0.6])}
@@ -150,10 +152,11 @@ def test_files_named_twice_and_other_outputs_are_refused(two, tmp_path):
     assert before == (tmp_path / "out.h5").read_bytes() != fuse(two, tmp_path / "out.h5", "3,1", True).path.read_bytes()
 
 
-def test_a_pipe_and_the_evaluation(dpc, two, tmp_path):
-    done = dpc("classify", "fuse", "-", two[1], "-o", "-", stdin=two[0].read_bytes())
-    assert done.returncode == 0, done.stderr.decode()
-    (tmp_path / "piped.h5").write_bytes(done.stdout)
+def test_stdin_and_stdout_and_the_evaluation(two, tmp_path, monkeypatch, capsysbinary):
+    with open(two[0]) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert exit_code("classify", "fuse", "-", two[1], "-o", "-") == 0
+    (tmp_path / "piped.h5").write_bytes(capsysbinary.readouterr().out)
     np.testing.assert_array_equal(ScoresReader(tmp_path / "piped.h5").scores, fuse(two, tmp_path / "both.h5").scores)
     said = CliRunner().invoke(app, ["evaluate", "classification", str(tmp_path / "piped.h5"), "--json"])
     streams = json.loads(said.stdout)["metrics"]["streams"]
@@ -175,7 +178,7 @@ def with_streams(path: Path, rows: dict, split: str = "test") -> Path:
     return path
 
 
-def test_the_streams_of_one_file_get_another_mean(dpc, tmp_path):
+def test_the_streams_of_one_file_get_another_mean(tmp_path, monkeypatch, capsys):
     rows = {"v0": (0, [0.6, 0.3, 0.1], [0.2, 0.3, 0.5]), "v1": (1, [1, 0, 0], [0, 1, 0])}
     one = with_streams(tmp_path / "one.h5", rows)
     found = fuse([one], tmp_path / "out.h5", "static=1,dynamic=3")
@@ -184,11 +187,11 @@ def test_the_streams_of_one_file_get_another_mean(dpc, tmp_path):
     np.testing.assert_allclose(fuse([one], tmp_path / "same.h5").scores, ScoresReader(one).scores, atol=1e-7)
     with pytest.raises(UsageError, match="expected dynamic=NUMBER,static=NUMBER"):
         fuse([one], tmp_path / "x.h5", "1,3")
-    done = dpc(
-        "classify", "fuse", "-", "-o", tmp_path / "piped.h5", "--weights", "dynamic=3,static=1", stdin=one.read_bytes()
-    )
-    assert done.returncode == 0, done.stderr.decode()
-    assert "weights dynamic 0.75, static 0.25" in done.stdout.decode()
+    with open(one) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        words = ("-", "-o", tmp_path / "piped.h5", "--weights", "dynamic=3,static=1")
+        assert exit_code("classify", "fuse", *words) == 0
+    assert "weights dynamic 0.75, static 0.25" in capsys.readouterr().out
     np.testing.assert_array_equal(ScoresReader(tmp_path / "piped.h5").scores, found.scores)
 
 

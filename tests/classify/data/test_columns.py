@@ -68,6 +68,20 @@ def test_columns_that_number_count_and_date_are_not_read_and_the_reason_is_told(
     assert set(read) == set(TELLING) and left_out == SENSELESS
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("frames", "points"), [(3, 4), (3, 10), (1, 30)])
+def test_short_and_sparse_videos_are_judged_without_a_warning(tmp_path, frames, points):
+    rng, noise = np.random.default_rng(0), kept_name("noise")
+    with CloudsWriter(tmp_path / "s.h5", class_names=["a", "b"], fields=[noise]) as writer:
+        for k in range(20):
+            clouds = [rng.normal(0, 0.1, (points, 3)).astype(np.float32) for _ in range(frames)]
+            video = CloudSequence.from_frames(f"v{k}", clouds, label=k % 2, split="train")
+            video.extra = {noise: rng.random(frames * points).astype(np.float32)}
+            writer.write(video)
+    read, left_out = telling_columns(CloudsReader(tmp_path / "s.h5"), range(20))
+    assert (read, left_out) == ((), {"noise": "might as well be drawn at random"})
+
+
 def test_a_number_that_names_joints_is_read(tmp_path):
     rng, joint = np.random.default_rng(0), kept_name("joint")
     with CloudsWriter(tmp_path / "j.h5", class_names=["a", "b"], fields=[joint]) as writer:

@@ -20,7 +20,10 @@ from dpcli.classify.data.validation_split import (
 from dpcli.classify.network import sync_norm
 from dpcli.classify.network.backbones.point_slots import slot_quantiles
 from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.settings import network_config
+from dpcli.classify.stream.sliding_window import StreamPredictor
+from dpcli.classify.training.fine_tune import freeze, train_mode
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -92,6 +95,25 @@ def test_a_video_of_one_frame_or_point_makes_a_clip(tmp_path, points):
         assert torch.isfinite(mode.static_logits(torch.from_numpy(clip)[None])).all()
 
 
+def test_a_column_of_one_sign_that_is_mostly_0_is_no_speed(tmp_path):
+    """Such as a count of targets: reversed in time, it keeps its sign."""
+    videos = [video(f"v{k}", seed=k) for k in range(3)]
+    for one in videos:
+        one.extra = {SPEED: np.where(np.arange(len(one.points)) % 3, 0, 5).astype(np.float32)}
+    assert config_of(tmp_path, videos).signed_columns == []
+
+
+def test_a_window_of_an_endless_stream_costs_no_more_at_its_end():
+    config = network_config(Given("sparse", sets=SMALL), 2)
+    config = config.changed(columns=("speed",), scales=(1.0, 0.0, 1.0))
+    predictor = StreamPredictor(
+        Kinet(config).eval(), ModelInfo(config, ["a", "b"], "slots", {"streams": ["static"]}), window=4
+    )
+    predictor.window.count = 10**12  # a list of so many frames would need terabytes
+    frames = np.ones((5, 3, 4), np.float32)
+    assert [made.frame for made in map(predictor.add, frames) if made] == [10**12 + k for k in range(5)]
+
+
 def test_changes_keep_the_order_in_time_and_change_speeds_together(tmp_path):
     config = config_of(tmp_path, [video(frames=40)])
     rows = slot_rows(video(frames=40), config)
@@ -122,7 +144,8 @@ def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):
     assert torch.allclose(mean, expected, atol=1e-6)
 
 
-def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
+@pytest.mark.parametrize("part", ["all", "head", "probe"])
+def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path, part):
     config = config_of(tmp_path, [video(str(k), seed=k) for k in range(6)])
     reader = CloudsReader(tmp_path / "c.h5")
     source = ClipSource(reader, range(6), config, timing="slots", folds={0: 0, 1: 1, 2: 0})
@@ -130,7 +153,9 @@ def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
     model = Kinet(config)
     nobody = model.static._voting_members(torch.tensor([0, 1, 0, -1, -1, -1]))
     assert nobody.tolist() == [[False, True], [True, False], [False, True], [False, True], [True, False], [False, True]]
-    model.train().static_logits(clips[:1]).sum().backward()
+    freeze(model.static, part)
+    train_mode(model.static, part)
+    model.static_logits(clips[:1]).sum().backward()
     grads = [sum(p.grad is not None for p in one.parameters()) for one in model.static.members]
     assert grads[0] == 0 < grads[1]
     scores = torch.softmax(model.eval().static_logits(clips), -1)
@@ -189,10 +214,8 @@ def test_details_tell_when_something_happens_and_are_not_moved_by_a_point_far_of
     assert torch.equal(before[0, 2], clips[0, 0, :, :3].sort(0).values[4]) and torch.isfinite(before).all()
     clips[0, 2] = 0  # a slot without points
     assert (slot_quantiles(clips).view(4, 5, 3)[2] == 0).all()
-    for details in (
-        True,
-        False,
-    ):  # without layers over time, what is read is a sum and a maximum, or one slot after the other
+    # without layers over time, what is read is a sum and a maximum, or one slot after the other
+    for details in (True, False):
         member = Kinet(config.changed(slot_details=details)).eval().static.members[0]
         member.over_time = torch.nn.ModuleList()
         here, late = (

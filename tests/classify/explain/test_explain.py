@@ -7,12 +7,14 @@ import dataclasses
 import io
 import json
 import sys
+import tracemalloc
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from torch import nn
 
 from dpcli.classify.commands.explain_pac import chosen_samples
@@ -250,9 +252,8 @@ def test_the_dynamic_stream_lights_up_what_moves_and_time_gone_it_does_not(tmp_p
     shape = rng.uniform(-0.05, 0.05, (8, 3))
     sizes = {"points_per_frame": 16, "neighbors": 24, "weighting": "none", "grouping": "balanced"}
     model = network(**sizes)
-    pass_through(
-        model.static.stage1, {axis: (axis, 1.0) for axis in range(3)}
-    )  # relu(x + 1) is linear within the radius
+    # relu(x + 1) is linear within the radius
+    pass_through(model.static.stage1, {axis: (axis, 1.0) for axis in range(3)})
     with torch.no_grad():
         for level in (0, 1):
             unit = model.dynamic.units[level]
@@ -332,8 +333,6 @@ def test_all_points_go_where_normalization_took_the_drawn_ones(data, rule):
 def test_rescaling_and_wrong_questions(data):
     np.testing.assert_allclose(rescaled(np.array([3, 5, 4], np.float32)), [0, 1, 0.5])
     assert not rescaled(np.full(4, 7, np.float32)).any()
-    with pytest.raises(UsageError, match="activation or gradient"):
-        Question("attention")
     reader = CloudsReader(data)  # labels 0 1 2 0 1 2
     picked = [chosen_samples(reader, wanted, range(6)) for wanted in ("2", "3", "4", "v5,v0,v5")]
     assert picked == [[0, 2], [0, 1, 2], [0, 3, 1, 2], [5, 0]]
@@ -485,15 +484,27 @@ def test_neighbor_accuracy_and_silhouette_against_other_programs():
         by_hand.append((b - a) / max(a, b))
     assert silhouette(more, unknown) == pytest.approx(np.mean(by_hand))
     assert neighbor_accuracy(features, rng.permutation(labels)) < other - 0.1  # shuffled labels are told
-    line = np.array(
-        [[0], [1], [2.1], [3.3]], np.float32
-    )  # each video has one of its own class and two of the other beside it
-    assert (
-        neighbor_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
-    )  # tied votes go to the nearest, which is the other
+    # each video has one of its own class and two of the other beside it
+    line = np.array([[0], [1], [2.1], [3.3]], np.float32)
+    # tied votes go to the nearest, which is the other
+    assert neighbor_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
     assert neighbor_accuracy(line, np.array([0, 0, 1, 1]), k=1) == 0.75
     for one_class in (np.zeros(4, int), np.full(4, -1)):
         assert neighbor_accuracy(line, one_class) is None and silhouette(line, one_class) is None
+
+
+def test_neighbors_of_many_videos_need_no_table_of_all_distances():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 30, 1500)
+    features = (rng.normal(size=(1500, 3)) + 9 * rng.normal(size=(30, 3))[labels]).astype(np.float32)
+    tracemalloc.start()
+    found = neighbor_accuracy(features, labels)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    near = cKDTree(features.astype(np.float64)).query(features, 6)[1][:, 1:]
+    by_hand = np.mean([max(own := labels[row].tolist(), key=own.count) == label for row, label in zip(near, labels)])
+    assert found == pytest.approx(by_hand, abs=1e-3) and 0.5 < found < 1
+    assert peak < 12e6  # all distances: 18 MB, and as much for their order
 
 
 def test_the_map_keeps_clusters_and_repeats_by_seed():

@@ -27,6 +27,15 @@ def test_votes_are_those_of_the_trees():
     assert np.abs(found - (votes + 1) / 26).max() < 1e-6 and (found[:, 1] == 1 / 26).all()
 
 
+def test_a_threshold_between_neighboring_numbers_parts_them():
+    """Two float32 without another between them: a threshold that is rounded to the larger sends both to the left."""
+    low = np.float32(1000)
+    values = np.array([[low], [np.nextafter(low, np.float32(2000))]], np.float32)
+    theirs = ExtraTreesClassifier(50, random_state=0).fit(values, [0, 1])
+    votes = Forest.grown(theirs, 3, 2)(torch.from_numpy(values)).numpy()
+    assert np.allclose(votes, np.array([[51, 1], [1, 51]]) / 52)
+
+
 def test_it_comes_back_from_its_tensors():
     ours, _, values = grown()
     again = Forest(20, 99, 6)

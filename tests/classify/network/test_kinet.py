@@ -64,6 +64,17 @@ def test_macs_of_the_static_stream_as_written():
     assert 5.3e9 < 2 * counts["dynamic"] < 6.1e9  # facts: 5.73e9
 
 
+def test_a_second_pass_of_the_static_layers_counts_for_the_dynamic_stream():
+    """The static stream costs the same alone, whether or not the dynamic stream has other neighborhoods."""
+    one, two = (
+        macs(Kinet(KinetConfig(**TINY, **own)).eval(), body_like_clip(4, 64))
+        for own in ({}, {"static_temporal_radius": 0})
+    )
+    assert two["static"] == one["static"] and two["static_as_written"] == one["static_as_written"]
+    again = two["dynamic"] - one["dynamic"]
+    assert 0 < again == two["total"] - one["total"] < one["static"]  # all but the head
+
+
 CONFIGS = [
     KinetConfig(**TINY),
     KinetConfig.release(**TINY),
@@ -354,9 +365,8 @@ def test_a_static_stream_of_its_own_is_that_of_a_network_of_its_reach_and_the_dy
         expected = model.static.stage2.taps(across[1], pooled)[0]
         assert all(map(torch.equal, stages[1].activations, expected))
         theirs = shared.static.taps(across)[0]
-        assert torch.equal(
-            stages[0].activations[1], theirs[0].activations[1]
-        )  # the first stage reads coordinates alone
+        # the first stage reads coordinates alone
+        assert torch.equal(stages[0].activations[1], theirs[0].activations[1])
         assert not torch.equal(stages[1].activations[1], theirs[1].activations[1])
     assert len(model.train().group(clip)) == 2  # training asks for its own alone
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -102,11 +101,12 @@ def test_wrong_use_is_refused(model, tmp_path, capsys, words, told):
     assert told in capsys.readouterr().err
 
 
-def test_a_pipeline_of_commands(model, tmp_path):
+def test_what_is_printed_is_evaluated_from_stdin(model, tmp_path, monkeypatch, capsys):
     clouds, truth = recordings(tmp_path / "c.h5"), tmp_path / "t.csv"
     truth.write_text(f"recording,start,end,class\nlong,0,30,{NAMES[0]}\nshort,0,2,{NAMES[1]}\n")
-    dpc = f"{sys.executable} -m dpcli"
-    line = f"{dpc} classify predict {clouds} --model {model} --segments -o - | {dpc} evaluate segments - --truth {truth} --json"
-    done = subprocess.run(line, shell=True, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["denominators"]["frames"] == 32
+    assert run(clouds, "--model", model, "-o", "-") == 0
+    (tmp_path / "printed.csv").write_text(capsys.readouterr().out)
+    with open(tmp_path / "printed.csv") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert exit_code("evaluate", "segments", "-", "--truth", truth, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["denominators"]["frames"] == 32

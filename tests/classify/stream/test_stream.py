@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -328,6 +329,21 @@ def test_a_folder_is_followed_in_order_of_names_and_half_a_file_is_waited_for(tm
     writer.join()
     assert last.shape == (400, 3) and last.dtype == np.float32
     assert "left out" in capfd.readouterr().err
+
+
+def test_a_look_into_a_folder_costs_what_is_new(tmp_path):
+    """Not all files that have come so far, of which an hour brings tens of thousands."""
+    files, ordered = cloud_files(), []
+
+    def order(path: Path) -> list:
+        ordered.append(path.name)
+        return files.order(path)
+
+    stream = open_frames(str(tmp_path), 0.5, replace(files, order=order))
+    for number in range(40):
+        np.save(tmp_path / f"f{number:02}.npy", np.full((2, 3), number + 1, np.float32))
+    assert [float(frame[0, 0]) for frame in stream] == list(range(1, 41))
+    assert len(ordered) < 2 * 40  # each file, and the last one until it had settled
 
 
 def test_frames_wait_in_bounded_room_and_none_is_lost():

@@ -11,6 +11,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import network_config, training_settings
+from dpcli.classify.training import fine_tune
 from dpcli.classify.training.fine_tune import _schedule, freeze, part_for, settings_from, train_mode
 from dpcli.classify.training.first_weights import take_weights
 from dpcli.classify.training.optimizer_step import StageStep
@@ -100,6 +101,20 @@ def test_bodies_in_another_unit_are_made_as_tall_as_the_model_knows_them(tmp_pat
     assert "in what the model learned from" in capsys.readouterr().err
 
 
+def test_a_file_in_the_order_of_its_classes_has_the_unit_of_all_of_them(tmp_path, monkeypatch):
+    """Whoever lies in the first ones is not small."""
+    monkeypatch.setattr(fine_tune, "_LOOKED_AT", 3)
+    rng = np.random.default_rng(0)
+    with CloudsWriter(tmp_path / "c.h5", class_names=["lie", "stand"]) as writer:
+        for k in range(9):
+            tall = 0.05 if k < 3 else 0.3
+            frames = [rng.normal(0, (0.3, tall, 0.1), (80, 3)).astype(np.float32) for _ in range(3)]
+            writer.write(CloudSequence.from_frames(f"v{k}", frames, label=int(k > 2), split="train"))
+    info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"])
+    with CloudsReader(tmp_path / "c.h5") as reader:
+        assert settings_from(info, reader, None)["network"].normalize == "center"
+
+
 @pytest.mark.parametrize("part", ["probe", "head", "all"])
 @pytest.mark.parametrize("stage", [0, 1])
 def test_only_what_learns_changes_and_batch_norms_of_the_rest_stay(part, stage, model):
@@ -159,6 +174,8 @@ def test_rows_of_the_last_layers_go_by_the_names_of_the_classes(preset, names, c
     sizes = {name: value for name, value in SMALL.items() if name != "timing"} if preset == "tiny" else {}
     theirs = ["a", "b", "c"]
     model = Kinet(network_config(Given(preset, sets=sizes), 3).changed(forest=(5, 7) if preset == "sparse" else (0, 0)))
+    if preset == "sparse":
+        model.static.forest_share.fill_(0.3)
     own_names = names.split(",")
     mine = Kinet(network_config(Given(preset, sets=sizes), len(own_names)))
     before = {key: value.clone() for key, value in rows(mine).items()}
@@ -168,7 +185,8 @@ def test_rows_of_the_last_layers_go_by_the_names_of_the_classes(preset, names, c
         for k, name in enumerate(own_names):
             expected = known[key][:, theirs.index(name)] if name in theirs else before[key][:, k]
             assert torch.equal(value[:, k], expected), (key, name)
-    others = {key: value for key, value in mine.state_dict().items() if key not in before and ".forest." not in key}
+    others = {key: value for key, value in mine.state_dict().items() if key not in before and ".forest" not in key}
+    assert preset != "sparse" or mine.static.forest_share == 0  # until there are forests
     assert all(torch.equal(value, model.state_dict()[key]) for key, value in others.items())
     shared = "".join(set(theirs) & set(own_names))
     told = (

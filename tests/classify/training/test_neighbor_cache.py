@@ -35,7 +35,7 @@ SMALL = (
     "--validation",
     "none",
     "--epochs",
-    "1",
+    "0",  # only the dynamic stage keeps neighbors
     "--lr",
     "0.001",
 )
@@ -139,16 +139,16 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
 
 
 @pytest.mark.parametrize(
-    "more", [(), ("--set", "clips_per_video=2", "--set", "video_loss=true")], ids=["clip", "video"]
+    ("more", "last"), [((), 4), (("--set", "clips_per_video=2", "--set", "video_loss=true"), 6)], ids=["clip", "video"]
 )
-def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch, more):
+def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch, more, last):
     words = (*SMALL, "--set", "epochs_dynamic=3", "--set", "draws=2", *more)
     assert dpc("classify", "train", data, "-o", tmp_path / "whole", *words) == 0
     take, taken = training.Trainer._take, []
 
     def stopping(self, *batch):
         taken.append(None)
-        if len(taken) == 6:  # in the second epoch of the dynamic stage
+        if len(taken) == last:  # in the second epoch
             self.stop.requested, self.stop.name = True, "a test"
         return take(self, *batch)
 

@@ -439,6 +439,18 @@ def test_what_can_not_be_judged_or_told_apart_is_said(tmp_path, make_sequence, c
     assert "class names repeat, such as 'up'" in capfd.readouterr().err and not (tmp_path / "d").exists()
 
 
+def test_validation_videos_that_are_left_out_are_told_and_not_counted(tmp_path, make_sequence, capfd):
+    splits = {"a": "train", "b": "train", "c": "validation", "short": "validation"}
+    with CloudsWriter(tmp_path / "v.h5", class_names=("up", "down")) as writer:
+        for i, (name, split) in enumerate(splits.items()):
+            writer.write(make_sequence(name, label=i % 2, frames=2 if name == "short" else 4, split=split))
+    words = (*SMALL, "--epochs", 0, "--set", "epochs_dynamic=0", "--set", "drop_short=true", "--validation", "split")
+    assert dpc("classify", "train", tmp_path / "v.h5", "-o", tmp_path / "run", *words) == 0
+    said = capfd.readouterr()
+    assert "1 video of fewer than 4 frames, dropped: short" in said.err
+    assert "\n1 validation video" in said.out  # the accuracy is of one
+
+
 def test_a_pipe_can_t_be_shared(monkeypatch, capfd):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert dpc("classify", "train", "-", "-o", "nowhere") == 2

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import batch_norm, linear
+from torch.nn.functional import linear
 
 from dpcli.classify.network.backbones.frame_graph import frame_graph, pool_edges
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage, require_frozen
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.layers import ClipLinear, SharedLayers
+from dpcli.classify.network.layers import ClipLinear, RowNorm, SharedLayers, remember
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.errors import UsageError
 from dpcli.ops import gather_points
@@ -25,23 +25,18 @@ _EPS = 1e-3
 
 
 class Dense(nn.Module):
-    """Computes a linear layer, batch norm over all rows and ReLU. A single row has no statistics: it gets the running ones.
+    """Computes a linear layer, batch norm over all rows and ReLU.
 
     linear: the layer's class, ClipLinear where rows are clips.
     """
 
     def __init__(self, inputs: int, width: int, linear: type[nn.Linear] = nn.Linear) -> None:
         super().__init__()
-        self.linear, self.norm = linear(inputs, width), nn.BatchNorm1d(width, eps=_EPS)
+        self.linear, self.norm = linear(inputs, width), RowNorm(width, eps=_EPS)
 
     def forward(self, values: Tensor) -> Tensor:
         """Returns (...,width) for values (...,C)."""
-        rows = self.linear(values.reshape(-1, values.shape[-1]))
-        if len(rows) > 1 or isinstance(self.norm, SyncNorm):
-            rows = self.norm(rows)
-        else:
-            norm = self.norm
-            rows = batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
+        rows = self.norm(self.linear(values.reshape(-1, values.shape[-1])))
         return torch.relu(rows).view(*values.shape[:-1], -1)
 
     def pool(self, values: Tensor) -> Tensor:
@@ -67,7 +62,7 @@ class Dense(nn.Module):
         if self.training:
             mean, var = image_statistics(values.flatten(0, 1), linear.weight)
             mean = mean + linear.bias
-            _remember(norm, mean, var, values.shape[0] * values.shape[1])
+            remember(norm, mean, var, values.shape[0] * values.shape[1])
         else:
             mean, var = norm.running_mean, norm.running_var
         return torch.relu((largest - mean) * (norm.weight * torch.rsqrt(var + norm.eps)) + norm.bias)
@@ -79,14 +74,6 @@ def image_statistics(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     centered = rows - mean.detach()  # they sum to zero: no gradient of the covariance passes through the mean
     covariance = centered.T @ centered / len(rows)
     return weight @ mean, ((weight @ covariance) * weight).sum(1).clamp(min=0)
-
-
-@torch.no_grad()
-def _remember(norm: nn.BatchNorm1d, mean: Tensor, var: Tensor, rows: int) -> None:
-    """Updates running statistics as BatchNorm1d does, from the mean and biased variance of so many rows."""
-    norm.num_batches_tracked += 1
-    norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
-    norm.running_var.lerp_((var * (rows / max(rows - 1, 1))).to(norm.running_var), norm.momentum)
 
 
 class DenseHead(nn.Module):
@@ -132,7 +119,7 @@ class EdgeConv(nn.Module):
         neighbor, own = _products(features, self.linear.weight * sign[:, None], self.linear.bias * sign)
         largest, total = pool_edges(neighbor, idx)
         mean, var = edge_statistics(neighbor, own, idx, total)
-        _remember(self.norm, mean * sign, var, idx.numel())
+        remember(self.norm, mean * sign, var, idx.numel())
         scale = self.norm.weight * sign * torch.rsqrt(var + self.norm.eps)
         return torch.relu((largest + own - mean) * scale + self.norm.bias)
 

@@ -15,7 +15,7 @@ from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.descriptors import clip_descriptors
 from dpcli.classify.network.forest import Forest
-from dpcli.classify.network.layers import ClipLinear
+from dpcli.classify.network.layers import ClipLinear, RowNorm
 from dpcli.classify.network.sync_norm import has_synchronized_norms
 from dpcli.errors import UsageError
 
@@ -185,7 +185,7 @@ class _TemporalConvolution(nn.Module):
     def __init__(self, width: int, step: int) -> None:
         super().__init__()
         self.mix = nn.Conv1d(width, width, _REACH, padding=step * (_REACH // 2), dilation=step)
-        self.norm, self.dropout = _Norm(width), nn.Dropout(_DROPPED)
+        self.norm, self.dropout = RowNorm(width), nn.Dropout(_DROPPED)
 
     def forward(self, slots: Tensor) -> Tensor:
         """Returns what is added to the slots."""
@@ -193,17 +193,5 @@ class _TemporalConvolution(nn.Module):
         return self.dropout(torch.relu(self.norm(mixed.flatten(0, 1)).view_as(mixed)))
 
 
-class _Norm(nn.BatchNorm1d):
-    """Normalizes as a BatchNorm1d; a batch of one row, such as a video's only point, as outside of training."""
-
-    def forward(self, rows: Tensor) -> Tensor:
-        """Returns rows (R,C) normalized."""
-        if len(rows) > 1:
-            return super().forward(rows)
-        return nn.functional.batch_norm(
-            rows, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps
-        )
-
-
 def _layer(inputs: int, outputs: int) -> tuple[nn.Module, ...]:
-    return nn.Linear(inputs, outputs), _Norm(outputs), nn.ReLU()
+    return nn.Linear(inputs, outputs), RowNorm(outputs), nn.ReLU()
