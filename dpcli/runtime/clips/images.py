@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -212,6 +212,13 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
             )
         return kept
     return list(paths)
+
+
+def refuse_twins(folder: Path, paths: Sequence[Path], advice: str) -> None:
+    """Raises DataError where two images differ in their suffixes alone, as pictures and their masks do: each would be a frame."""
+    for stem, count in Counter(path.stem for path in paths).items():
+        if count > 1:
+            raise DataError(f"{folder}: {stem!r} is there with two suffixes; {advice}")
 
 
 def _pattern_of_one(first: str, others: list[str]) -> str:
