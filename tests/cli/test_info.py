@@ -249,3 +249,22 @@ def test_dots_of_an_embedding_stay_apart_whatever_their_scale(scale: float) -> N
     page = scatter_page(PageFacts("e", ""), [""] * 40, [], np.zeros(40, int), {"static": (places, {})})
     shown = json.loads(re.search(r'id="header">(.*?)</script>', page, re.S)[1])["planes"][0]["places"]
     assert np.abs(np.array(shown) - places).max() <= 1e-4 * np.ptp(places)
+
+
+def test_settings_beside_a_model_that_another_program_wrote_are_told(dpc_here, tmp_path: Path) -> None:
+    """TOML has dates and NaN, which JSON has not."""
+    from safetensors.numpy import save_file
+
+    save_file({"a": np.zeros(3, np.float32)}, tmp_path / "m.safetensors")
+    (tmp_path / "settings.toml").write_text("made = 2024-01-02\n[train]\nlr = nan\nsteps = 5\n")
+    told = json.loads(dpc_here("info", tmp_path / "m.safetensors", "--json").stdout)
+    assert told["settings"] == {"made": "2024-01-02", "train": {"lr": "NaN", "steps": 5}}
+    assert b"train lr                 NaN\n" in dpc_here("info", tmp_path / "m.safetensors").stdout
+
+
+@pytest.mark.parametrize("words", [("--sequence", "s0"), ("--view", "x-zy")])
+def test_options_of_pictures_are_refused_without_one(clouds: Path, words: tuple[str, str], dpc_here) -> None:
+    """Of a model as well, whose other options say that it has neither."""
+    for file in (clouds, "msraction3d-24"):
+        refused = dpc_here("info", file, *words)
+        assert refused.returncode == 2 and words[0].encode() in refused.stderr and b"--page" in refused.stderr
