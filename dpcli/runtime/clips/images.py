@@ -202,7 +202,7 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
         )
     if len(several) == 1 and len(series) > 1:
         kept = next(iter(several.values()))
-        others = [path.name for path in paths if path not in kept]
+        others = [own[0].name for own in series.values() if len(own) == 1]
         if len(others) >= len(kept):
             return list(paths)
         if not quiet:
