@@ -19,15 +19,20 @@ from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.sequence_pass import Keeping
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from dpcli.store.gaussians import write_scene
+from tests.support.commands import told
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 from tests.support.scenes import toy_scene
 
 ROOT = Path(__file__).parents[2]
 
 
-def dpc(*arguments: object, stdin: bytes | None = b"", cwd: Path = ROOT) -> subprocess.CompletedProcess:
+def dpc(*arguments: object, stdin: bytes | None = None) -> subprocess.CompletedProcess:
+    """In this process, or in one of its own where something comes through a pipe."""
+    if stdin is None:
+        done = told(*arguments)
+        return subprocess.CompletedProcess(arguments, done.returncode, done.stdout.encode(), done.stderr.encode())
     command = [sys.executable, "-m", "dpcli", *map(str, arguments)]
-    return subprocess.run(command, input=stdin, capture_output=True, cwd=cwd, timeout=120)
+    return subprocess.run(command, input=stdin, capture_output=True, cwd=ROOT, timeout=120)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +57,7 @@ def scores(clouds: Path) -> Path:
 
 
 def test_a_file_and_a_pipe_say_the_same(clouds: Path) -> None:
-    direct, piped = dpc("info", clouds, "--json"), dpc("info", "-", "--json", stdin=clouds.read_bytes())
+    direct, piped = dpc("info", clouds, "--json", stdin=b""), dpc("info", "-", "--json", stdin=clouds.read_bytes())
     assert (direct.returncode, piped.returncode) == (0, 0) and direct.stderr == b""
     first, second = json.loads(direct.stdout), json.loads(piped.stdout)
     assert first.pop("file") == str(clouds) and second.pop("file") == "-"
@@ -257,8 +262,8 @@ def test_settings_beside_a_model_that_another_program_wrote_are_told(dpc_here, t
 
     save_file({"a": np.zeros(3, np.float32)}, tmp_path / "m.safetensors")
     (tmp_path / "settings.toml").write_text("made = 2024-01-02\n[train]\nlr = nan\nsteps = 5\n")
-    told = json.loads(dpc_here("info", tmp_path / "m.safetensors", "--json").stdout)
-    assert told["settings"] == {"made": "2024-01-02", "train": {"lr": "NaN", "steps": 5}}
+    said = json.loads(dpc_here("info", tmp_path / "m.safetensors", "--json").stdout)
+    assert said["settings"] == {"made": "2024-01-02", "train": {"lr": "NaN", "steps": 5}}
     assert b"train lr                 NaN\n" in dpc_here("info", tmp_path / "m.safetensors").stdout
 
 
