@@ -267,6 +267,14 @@ def test_settings_beside_a_model_that_another_program_wrote_are_told(dpc_here, t
     assert b"train lr                 NaN\n" in dpc_here("info", tmp_path / "m.safetensors").stdout
 
 
+def test_provenance_with_nan_of_another_program_is_told(clouds: Path, dpc_here, tmp_path: Path) -> None:
+    shutil.copy(clouds, tmp_path / "c.h5")
+    with h5py.File(tmp_path / "c.h5", "r+") as file:
+        file["provenance"][0] = '{"command": "theirs", "config": {"scale": NaN}}'
+    done = dpc_here("info", tmp_path / "c.h5", "--json")
+    assert json.loads(done.stdout)["provenance"] == [{"command": "theirs", "config": {"scale": "NaN"}}], done.stderr
+
+
 @pytest.mark.parametrize("words", [("--sequence", "s0"), ("--view", "x-zy")])
 def test_options_of_pictures_are_refused_without_one(clouds: Path, words: tuple[str, str], dpc_here) -> None:
     """Of a model as well, whose other options say that it has neither."""
