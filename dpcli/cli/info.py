@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from dpcli.cli.options import Json, Picture
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.standard_streams import printable, rich_console
 
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
@@ -51,7 +51,7 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary, without_best
     from dpcli.store import input_file
     from dpcli.store.summary import summary
 
@@ -69,6 +69,8 @@ def info(
             raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
         _tell({"file": str(model), **weights_summary(model), **_settings_beside(model)}, as_object, _show_model)
         return
+    if model is None and (said := without_best(file)):
+        raise DataError(f"{file}: {said}")
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:

@@ -233,6 +233,11 @@ def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
     assert b"model, of another program" in dpc_here("info", weights).stdout
     refused = dpc_here("info", weights, "--picture", tmp_path / "x.png")
     assert refused.returncode == 2 and b"holds weights" in refused.stderr
+    (weights.parent / "config.json").write_text("{}")
+    last = weights.rename(weights.with_name("last.safetensors"))
+    early = dpc_here("info", weights.parent)
+    assert early.returncode == 3 and f"no best.safetensors yet; {last} has the weights".encode() in early.stderr
+    last.rename(weights)
     weights.write_bytes(weights.read_bytes()[:-9])
     cut = dpc_here("info", weights)
     assert cut.returncode == 3 and b"not a complete safetensors file" in cut.stderr
