@@ -6,8 +6,9 @@ import errno
 import os
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -44,9 +45,7 @@ def regular_files_only() -> Iterator[None]:
     So no reader and no library (NumPy, Pillow, zipfile) needs to ask first about the files that lie in a sample's folder.
     """
     global _refusing
-    if _refuse_odd not in _installed:
-        sys.addaudithook(_refuse_odd)
-        _installed.add(_refuse_odd)
+    _install()
     before, _refusing = _refusing, True
     try:
         yield
@@ -61,4 +60,6 @@ def _refuse_odd(event: str, arguments: tuple) -> None:
             raise DataError(f"{path}: {reason}; it was not opened")
 
 
-_installed: set[Callable[[str, tuple], None]] = set()  # audit hooks stay for good
+@cache  # once in a process: audit hooks stay for good
+def _install() -> None:
+    sys.addaudithook(_refuse_odd)

@@ -48,11 +48,12 @@ def decode_text(path: Path) -> str:
             raise DataError(f"{path}: not text; expected numbers in columns")
         encoding = "utf-16-be" if zeros[0] > zeros[1] else "utf-16-le"
     try:
-        return data.decode(encoding or "utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        text = data.decode(encoding or "utf-8")
     except UnicodeDecodeError:
         if encoding:
             raise DataError(f"{path}: not readable as {encoding}, perhaps truncated; save it as UTF-8") from None
-        return data.decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: Path) -> Any:

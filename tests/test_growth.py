@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import tracemalloc
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from dpcli.prepare.array_files.choosing import find_beside
 from dpcli.prepare.array_files.containers import ByName
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.series import choose_series
+from dpcli.runtime.clips.images import one_series
+from dpcli.runtime.whole_file import whole_file, write_whole
 from dpcli.store import summary
 
 _MOST = 2.7  # times the steps for twice as many; 4 where each is compared with all
@@ -87,12 +90,32 @@ def _map_labels(count: int) -> Callable[[], object]:
     return lambda: LabelMap(labels={"class 0": "none"}).resolve(sources)
 
 
-@pytest.mark.parametrize("case", [_measure, _count_classes, _refuse_series, _look_beside, _map_labels])
+def _choose_images(count: int) -> Callable[[], object]:
+    images = [Path(f"walk_{k}.png") for k in range(count)]
+    return lambda: one_series(Path("walk"), [*images, Path("lone.png")], quiet=True)
+
+
+CASES = [_measure, _count_classes, _refuse_series, _look_beside, _map_labels, _choose_images]
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_twice_as_many_take_twice_the_steps(case: Callable[[int], Callable[[], object]]) -> None:
     """Samples, classes, series in a folder, sequences in a file: each is looked at once, not once for each of the others."""
     case(2)()  # imports and compiled patterns
     few, many = (Steps().of(case(count)) for count in (_FEW, 2 * _FEW))
     assert many < _MOST * few
+
+
+def test_a_frame_written_into_a_folder_looks_through_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What killed processes left is looked for beside the folder, once; each of a thousand frames looked through the others."""
+    looked = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda place: looked.append(place) or scandir(place))
+    with whole_file(tmp_path / "frames") as folder:
+        folder.mkdir()
+        for k in range(3):
+            write_whole(folder / f"{k}.ply", b"")
+        assert looked == [tmp_path]
 
 
 def _peak(work: Callable[[], object]) -> int:

@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, file_names, utf8_path
 from dpcli.prepare.articulated.urdf import read_skeleton
 from dpcli.runtime.weights import load_weights, save_weights
-from dpcli.store import CloudsReader
+from dpcli.store import CloudsReader, ViewsReader
+from tests.support.commands import exit_code
 
 
 @pytest.fixture
@@ -73,3 +75,14 @@ def test_names_in_a_file_become_different_names_of_files():
     assert found[:4] == ["a_b_1", "a_b_1_", "a_b_2", "object_3"]
     assert len({name.lower() for name in found}) == len(names)
     assert all(name and Path(name).name == name and name.strip(".") and len(os.fsencode(name)) < 250 for name in found)
+
+
+def test_a_clip_whose_name_is_not_utf8_becomes_a_file_of_views(latin1, tmp_path):
+    """Its folder names the object; HDF5 holds no byte of another encoding."""
+    for frame in range(2):
+        picture = np.zeros((24, 24, 4), np.uint8)
+        picture[6:18, 4 + frame : 16 + frame] = 255
+        Image.fromarray(picture).save(latin1 / f"{frame}.png")
+    assert exit_code("prepare", "video", latin1, "-o", tmp_path / "v.h5", "--size", "32") == 0
+    with ViewsReader(tmp_path / "v.h5") as reader:
+        assert reader.header.name == r"caf\xe9"

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from dpcli.cli.options import Json, Picture
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.standard_streams import printable, rich_console
 
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
@@ -51,10 +51,14 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary, without_best
     from dpcli.store import input_file
     from dpcli.store.summary import summary
 
+    if sequence and page is None:
+        raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
+    if view is not None and picture is None and page is None:
+        raise UsageError("--view turns what --picture and --page show; give one of them, too")
     model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
     if model is not None and model.suffix == SUFFIX:
         if picture is not None:
@@ -65,8 +69,8 @@ def info(
             raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
         _tell({"file": str(model), **weights_summary(model), **_settings_beside(model)}, as_object, _show_model)
         return
-    if sequence and page is None:
-        raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
+    if model is None and (said := without_best(file)):
+        raise DataError(f"{file}: {said}")
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:
@@ -86,11 +90,15 @@ def _write_page(path: Path, found: dict[str, Any], page: Path, **choice: Any) ->
 
 
 def _settings_beside(model: Path) -> dict[str, Any]:
-    """Returns the settings of the run that made the weights, by group, where its folder holds them."""
+    """Returns the settings of the run that made the weights, by group, where its folder holds them; dates and NaN, which ours
+    never are, as text.
+    """
     from dpcli.text_files import read_toml
 
     file = model.parent / "settings.toml"
-    return {"settings": read_toml(file)} if file.is_file() else {}
+    return (
+        {"settings": json.loads(json.dumps(read_toml(file), default=str), parse_constant=str)} if file.is_file() else {}
+    )
 
 
 def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.standard_streams import printable
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from dpcli.store import CloudsReader
 
 PAGES = (".html", ".htm")
+_many = partial(counted, form=",")
 _PICTURES, _SIDE = 480, 256  # pictures on a page of views; pixels of the longer side
 
 
@@ -158,11 +161,6 @@ def _cloud_words(reader: CloudsReader, kind: str) -> str:
     usual = f"{about}{_many(int(np.median(sizes)) if len(sizes) else 0, 'point')} a frame"
     words = [kind, _many(len(reader), "sequence"), _many(int(reader.frame_counts.sum()), "frame"), usual]
     return " · ".join([*words, *([_many(len(reader.class_names), "class")] if reader.class_names else [])])
-
-
-def _many(count: int, word: str) -> str:
-    ending = "" if count == 1 else "es" if word.endswith("s") else "s"
-    return f"{count:,} {word}{ending}"
 
 
 def _left_out(reader: CloudsReader, frames: dict[int, list[int]], most: int, chosen: bool) -> list[str]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, get_args, get_type_hints
 
@@ -29,7 +29,7 @@ def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
     groups = {name: one.annotation for name, one in own.items() if is_dataclass(one.annotation)}
     options: list[inspect.Parameter] = []
     for name, one in own.items():
-        options += _options_of(groups[name]) if name in groups else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+        options += _options_of(groups[name]) if name in groups else [one]
     names = [one.name for one in options]
     if len(set(names)) < len(names):
         raise ValueError(f"{command.__name__}: an option is there twice among {', '.join(names)}")
@@ -41,8 +41,14 @@ def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
         }
         return command(**values, **made)
 
-    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in options}
+    return with_parameters(run, options)
+
+
+def with_parameters(run: Callable[..., Any], parameters: Sequence[inspect.Parameter]) -> Callable[..., Any]:
+    """Returns a function, wrapped around a command, as one of these parameters for typer, each given by its name."""
+    keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
+    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in keywords}
     del run.__wrapped__  # type: ignore[attr-defined]  # else typer may read the command's own parameters
     return run
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,11 @@ _LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
 
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
 Scene = Annotated[str, typer.Argument(help="A gaussians file, or - for a pipe.")]
+
+
+def completion(words: Sequence[str]) -> Callable[[str], list[str]]:
+    """Returns what completes the begun value of an option in a shell: those of some words that begin so."""
+    return lambda incomplete: [word for word in words if word.startswith(incomplete)]
 
 
 def _read_seed(text: str) -> int:

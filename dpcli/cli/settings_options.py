@@ -18,6 +18,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from dpcli.cli.help_groups import SETTINGS
+from dpcli.cli.option_groups import with_parameters
+from dpcli.cli.options import completion
 from dpcli.cli.out_of_memory import naming_large
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import Setting, settings_of
@@ -56,12 +58,7 @@ def options_of(
             ):
                 return command(**{receiver: given}, **values)
 
-        parameters = [two for name, one in own.items() for two in (made if name == receiver else [one])]
-        keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
-        run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in keywords}
-        del run.__wrapped__  # type: ignore[attr-defined]  # else typer may read the command's own parameters
-        return run
+        return with_parameters(run, [two for name, one in own.items() for two in (made if name == receiver else [one])])
 
     return decorate
 
@@ -86,7 +83,7 @@ def _preset_option(presets: Presets, default: str | None) -> list[inspect.Parame
         parser=words.parse,
         metavar=metavar(words.hint),
         help=words.help,
-        autocompletion=_completion(words_of(words.hint)),
+        autocompletion=completion(words_of(words.hint)),
     )
     return [_parameter("preset_name", Annotated[str, option], default)]
 
@@ -105,7 +102,7 @@ def _flag(one: Setting, default: str) -> inspect.Parameter:
         return _SAID_NONE if value is None else value
 
     info = typer.Option(
-        option, parser=read, metavar=metavar(one.hint), help=about, autocompletion=_completion(words_of(one.hint))
+        option, parser=read, metavar=metavar(one.hint), help=about, autocompletion=completion(words_of(one.hint))
     )
     shape = inner if inner in (int, float) else str  # words and tuples are text to typer
     return _parameter(one.name, Annotated[shape | None, info], None)
@@ -123,7 +120,7 @@ def _general_options(catalog: Catalog, presets: Presets) -> list[inspect.Paramet
         "--set",
         metavar="NAME=VALUE",
         rich_help_panel=SETTINGS,
-        autocompletion=_completion(words),
+        autocompletion=completion(words),
         help="Change any setting; may be repeated. --help-all lists them.",
     )
 
@@ -180,13 +177,6 @@ def _everyday_default(one: Setting, catalog: Catalog, presets: Presets) -> str:
 
 def _written(value: Any) -> str:
     return write_text(value) or "empty"
-
-
-def _completion(words: Sequence[str]) -> Callable[[str], list[str]]:
-    def complete(incomplete: str) -> list[str]:
-        return [word for word in words if word.startswith(incomplete)]
-
-    return complete
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:

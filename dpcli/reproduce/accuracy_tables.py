@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dpcli.counted import counted
 from dpcli.reproduce.runs import (
     DASH,
     Cell,
@@ -27,7 +28,6 @@ from dpcli.reproduce.runs import (
     refuse_unknown,
     samples,
     shares,
-    some,
     spread,
     thesis_rows,
     write_json,
@@ -234,7 +234,7 @@ def make(
     """Runs what isn't done; writes table.md and results.json after every cell. clouds: by name, the prepared files."""
     about = (
         f"Ours: {plan} and each line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "
-        f"{some(plan.clips, 'clip') if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
+        f"{counted(plan.clips, 'clip') if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
         + (", mean of 10 runs." if experiment.short else ".")
     )
     cells: dict[str, dict[int, dict]] = {one.key: {} for one in experiment.settings}

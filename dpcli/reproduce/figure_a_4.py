@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.draw.sheet import save_figure
 from dpcli.errors import DataError
 from dpcli.evaluate.classification.metrics import predicted_labels
-from dpcli.reproduce.runs import DASH, markdown, some, write_json, write_text
+from dpcli.reproduce.runs import DASH, markdown, write_json, write_text
 from dpcli.store import ScoresReader
 
 SAID = {  # A.2.2: what the thesis says of single classes; the figure prints no numbers
@@ -102,12 +103,12 @@ def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict
     """Writes picture and table of scores files. flow: the flow baseline's, which hold its static scores as a stream too."""
     names, base, own = gains(files)
     found = {"kinet": own}
-    about = f"Ours: mean over {some(len(files), 'run')} (seeds)."
+    about = f"Ours: mean over {counted(len(files), 'run')} (seeds)."
     if flow:
         others, _, found["flow"] = gains(flow)
         if others != names:
             raise DataError(f"{flow[0]}: other classes than {files[0]}")
-        about += f" Flow-based two streams: {some(len(flow), 'run')}, over their own static networks."
+        about += f" Flow-based two streams: {counted(len(flow), 'run')}, over their own static networks."
     write_json(
         folder / "results.json",
         {

@@ -260,11 +260,6 @@ def shares(found: Sequence[dict], stream: str) -> list[float]:
     return [100 * one["correct"][stream] / one["samples"] for one in found if stream in one["correct"]]
 
 
-def some(number: int, thing: str) -> str:
-    """Returns a number with its thing: '1 clip', '8 clips'."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 def spread(values: Sequence[float], digits: int = 2) -> str:
     """Returns `mean ± sd` over runs, n - 1 in the denominator; the value alone for one run, a dash for none."""
     known = [value for value in values if math.isfinite(value)]

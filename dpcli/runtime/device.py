@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
+from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.tuning import choose_products
 
@@ -34,8 +35,10 @@ def choose_device(name: str = "auto"):
         device = None
     if device is None or device.type not in ("cpu", "cuda"):  # torch knows more, of which none was tried
         raise UsageError(f"--device {name}: unknown device; use auto, cpu, cuda or cuda:N")
-    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
-        raise UsageError(f"--device {name}: {torch.cuda.device_count()} CUDA devices are visible; use --device cpu")
+    visible = torch.cuda.device_count() if device.type == "cuda" else 0
+    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= visible):
+        one = "--device cuda or cpu" if torch.cuda.is_available() else "--device cpu"
+        raise UsageError(f"--device {name}: {counted(visible, 'CUDA device')} visible; use {one}")
     if device.type == "cpu":
         choose_products()
     return device

@@ -56,18 +56,23 @@ def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str
     path = locate_weights(name, [shipped] if shipped else [])
     if path is not None:
         return path
-    if Path(name, "config.json").is_file():
-        last = Path(name, "last.safetensors")
-        now = f"{last} has the weights of its last epoch; " if last.is_file() else ""
-        raise DataError(
-            f"{option} {name}: this training has no best.safetensors yet; {now}run its `{maker}` again to continue it"
-        )
+    if said := without_best(name):
+        raise DataError(f"{option} {name}: {said}; run its `{maker}` again to continue it")
     what = why_unreadable(name) or ("holds no trained model" if Path(name).is_dir() else "no such file")
     ours = ", ".join(shipped_models(shipped)) if shipped else ""
     raise DataError(
         f"{option} {name}: {what}; give a .safetensors file, a folder made by `{maker}`"
         f" or a shipped model ({ours or 'none in this installation'})"
     )
+
+
+def without_best(folder: str | Path) -> str:
+    """Returns what to say of the folder of a training that has written no `best.safetensors`; "" for anything else."""
+    if not Path(folder, "config.json").is_file() or Path(folder, f"best{SUFFIX}").is_file():
+        return ""
+    last = Path(folder, f"last{SUFFIX}")
+    now = f"; {last} has the weights of its last epoch" if last.is_file() else ""
+    return f"this training has no best{SUFFIX} yet{now}"
 
 
 def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:

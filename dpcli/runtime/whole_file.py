@@ -145,7 +145,12 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def _remove_killed(path: Path) -> None:
-    """Removes what killed processes of this machine left of a file or folder that they were writing."""
+    """Removes what killed processes of this machine left of a file or folder that they were writing.
+
+    There is nothing of them in a folder that this process is writing itself: its files, which may be many, aren't looked through.
+    """
+    if path.parent.name.startswith(".") and f".{os.getpid()}.part" in path.parent.name:
+        return
     name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.(part|old){re.escape(path.suffix)}")
     with suppress(OSError), os.scandir(path.absolute().parent) as beside:
         for one in beside:

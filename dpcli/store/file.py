@@ -238,7 +238,8 @@ def read_provenance(file: h5py.File) -> list[dict]:
     if "provenance" not in file:
         return []
     try:
-        found = [json.loads(entry) for entry in file["provenance"].asstr()[:]]  # half letters too: of names of files
+        # half letters too: of names of files; NaN of other programs as text, which JSON can write again
+        found = [json.loads(entry, parse_constant=str) for entry in file["provenance"].asstr()[:]]
     except (ValueError, TypeError, RecursionError):
         raise DataError(f"{file.filename}: provenance is not JSON; the file was changed by another program") from None
     for entry in found:

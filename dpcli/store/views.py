@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, reading
+from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
     PACKED,
@@ -168,7 +169,7 @@ class ViewsWriter:
             class_names=(),
             provenance=self.provenance,
         )
-        file.attrs.update({"name": header.name, "reference": int(header.reference)})
+        file.attrs.update({"name": as_utf8(header.name), "reference": int(header.reference)})
         width, height = header.size
         picture = (height, width, 4)
         shape = (header.num_views, header.num_frames, *picture)

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.support.commands import told
+
 ASK = {
     "bash": lambda words: {"COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)},
     "zsh": lambda words: {"_TYPER_COMPLETE_ARGS": " ".join(words)},
@@ -24,10 +26,11 @@ ASK = {
         (("dpc", "classify", "train", "--pre"), "--preset", "--epochs"),
     ],
 )
-def test_commands_and_options_are_completed(dpc, shell, words, expected, other):
-    done = dpc(_DPC_COMPLETE=f"complete_{shell}", **ASK[shell](words))
-    answer = done.stdout.decode()
-    assert done.returncode == 0 and expected in answer and other not in answer
+def test_commands_and_options_are_completed(monkeypatch, shell, words, expected, other):
+    for name, value in {"_DPC_COMPLETE": f"complete_{shell}", **ASK[shell](words)}.items():
+        monkeypatch.setenv(name, value)
+    done = told()
+    assert done.returncode == 0 and expected in done.stdout and other not in done.stdout
 
 
 def test_completion_loads_no_heavy_library():

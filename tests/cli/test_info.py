@@ -19,15 +19,20 @@ from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.sequence_pass import Keeping
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from dpcli.store.gaussians import write_scene
+from tests.support.commands import told
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 from tests.support.scenes import toy_scene
 
 ROOT = Path(__file__).parents[2]
 
 
-def dpc(*arguments: object, stdin: bytes | None = b"", cwd: Path = ROOT) -> subprocess.CompletedProcess:
+def dpc(*arguments: object, stdin: bytes | None = None) -> subprocess.CompletedProcess:
+    """In this process, or in one of its own where something comes through a pipe."""
+    if stdin is None:
+        done = told(*arguments)
+        return subprocess.CompletedProcess(arguments, done.returncode, done.stdout.encode(), done.stderr.encode())
     command = [sys.executable, "-m", "dpcli", *map(str, arguments)]
-    return subprocess.run(command, input=stdin, capture_output=True, cwd=cwd, timeout=120)
+    return subprocess.run(command, input=stdin, capture_output=True, cwd=ROOT, timeout=120)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +57,7 @@ def scores(clouds: Path) -> Path:
 
 
 def test_a_file_and_a_pipe_say_the_same(clouds: Path) -> None:
-    direct, piped = dpc("info", clouds, "--json"), dpc("info", "-", "--json", stdin=clouds.read_bytes())
+    direct, piped = dpc("info", clouds, "--json", stdin=b""), dpc("info", "-", "--json", stdin=clouds.read_bytes())
     assert (direct.returncode, piped.returncode) == (0, 0) and direct.stderr == b""
     first, second = json.loads(direct.stdout), json.loads(piped.stdout)
     assert first.pop("file") == str(clouds) and second.pop("file") == "-"
@@ -228,6 +233,11 @@ def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
     assert b"model, of another program" in dpc_here("info", weights).stdout
     refused = dpc_here("info", weights, "--picture", tmp_path / "x.png")
     assert refused.returncode == 2 and b"holds weights" in refused.stderr
+    (weights.parent / "config.json").write_text("{}")
+    last = weights.rename(weights.with_name("last.safetensors"))
+    early = dpc_here("info", weights.parent)
+    assert early.returncode == 3 and f"no best.safetensors yet; {last} has the weights".encode() in early.stderr
+    last.rename(weights)
     weights.write_bytes(weights.read_bytes()[:-9])
     cut = dpc_here("info", weights)
     assert cut.returncode == 3 and b"not a complete safetensors file" in cut.stderr
@@ -249,3 +259,30 @@ def test_dots_of_an_embedding_stay_apart_whatever_their_scale(scale: float) -> N
     page = scatter_page(PageFacts("e", ""), [""] * 40, [], np.zeros(40, int), {"static": (places, {})})
     shown = json.loads(re.search(r'id="header">(.*?)</script>', page, re.S)[1])["planes"][0]["places"]
     assert np.abs(np.array(shown) - places).max() <= 1e-4 * np.ptp(places)
+
+
+def test_settings_beside_a_model_that_another_program_wrote_are_told(dpc_here, tmp_path: Path) -> None:
+    """TOML has dates and NaN, which JSON has not."""
+    from safetensors.numpy import save_file
+
+    save_file({"a": np.zeros(3, np.float32)}, tmp_path / "m.safetensors")
+    (tmp_path / "settings.toml").write_text("made = 2024-01-02\n[train]\nlr = nan\nsteps = 5\n")
+    said = json.loads(dpc_here("info", tmp_path / "m.safetensors", "--json").stdout)
+    assert said["settings"] == {"made": "2024-01-02", "train": {"lr": "NaN", "steps": 5}}
+    assert b"train lr                 NaN\n" in dpc_here("info", tmp_path / "m.safetensors").stdout
+
+
+def test_provenance_with_nan_of_another_program_is_told(clouds: Path, dpc_here, tmp_path: Path) -> None:
+    shutil.copy(clouds, tmp_path / "c.h5")
+    with h5py.File(tmp_path / "c.h5", "r+") as file:
+        file["provenance"][0] = '{"command": "theirs", "config": {"scale": NaN}}'
+    done = dpc_here("info", tmp_path / "c.h5", "--json")
+    assert json.loads(done.stdout)["provenance"] == [{"command": "theirs", "config": {"scale": "NaN"}}], done.stderr
+
+
+@pytest.mark.parametrize("words", [("--sequence", "s0"), ("--view", "x-zy")])
+def test_options_of_pictures_are_refused_without_one(clouds: Path, words: tuple[str, str], dpc_here) -> None:
+    """Of a model as well, whose other options say that it has neither."""
+    for file in (clouds, "msraction3d-24"):
+        refused = dpc_here("info", file, *words)
+        assert refused.returncode == 2 and words[0].encode() in refused.stderr and b"--page" in refused.stderr

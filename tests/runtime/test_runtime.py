@@ -226,8 +226,14 @@ def test_devices(monkeypatch):
     for name in ("gpu", "", "cuda:x", "mps", "meta"):  # torch knows the last two; nothing here was tried there
         with pytest.raises(UsageError, match="unknown device"):
             device.choose_device(name)
-    with pytest.raises(UsageError, match="CUDA devices are visible"):
-        device.choose_device("cuda:77")
+    for count, said in (
+        (0, "0 CUDA devices visible; use --device cpu"),
+        (1, "1 CUDA device visible; use --device cuda or"),
+    ):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda count=count: count > 0)
+        with pytest.raises(UsageError, match=f"--device cuda:77: {said}"):
+            device.choose_device("cuda:77")
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
     assert device.cpu_count() == 1
 

@@ -129,9 +129,8 @@ def _with_true_times(found: WindowScores, name: str) -> WindowScores:
     if not len(back):
         return found
     at = int(back[0]) + 1
-    times = f"{len(back)} time{'' if len(back) == 1 else 's'}"
     log.warn(
-        f"{name}: time runs back {times}, first at frame {at} ({found.time[at - 1]:g} s, then {found.time[at]:g} s);"
+        f"{name}: time runs back {counted(len(back), 'time')}, first at frame {at} ({found.time[at - 1]:g} s, then {found.time[at]:g} s);"
         " frames are taken in their order, and no seconds are written"
     )
     return replace(found, time=None)

@@ -69,7 +69,7 @@ class View:
                 Text(f"the window of {counted(self.speaker.window, 'frame')} is not full yet"), title=told, width=72
             )
         probabilities, latency, waiting = self.newest
-        behind = f", {waiting} frame{'' if waiting == 1 else 's'} waiting" if waiting else ""
+        behind = f", {counted(waiting, 'frame')} waiting" if waiting else ""
         foot = Text(f"latency {1000 * latency:.0f} ms{behind}", style="dim")
         return Panel(Group(self._headline(), *self._bars(probabilities), self._strip(), foot), title=told, width=72)
 

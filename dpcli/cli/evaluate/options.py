@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpcli.cli.options import Force, Json, Picture, Seed
+from dpcli.cli.options import Force, Json, Picture, Seed, completion
 from dpcli.cli.spread_options import SpreadOptions
 from dpcli.errors import UsageError
 from dpcli.evaluate.choices import PARTS_PROTOCOLS
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 def word_option(option: str, words: Sequence[str], help: str) -> Any:
     """Returns an option that takes one of some words, which `--help` lists; another word ends with the nearest legal one."""
-
-    def complete(incomplete: str) -> list[str]:
-        return [word for word in words if word.startswith(incomplete)]
-
     return typer.Option(
-        option, parser=_word_parser(option, words), metavar=f"[{'|'.join(words)}]", help=help, autocompletion=complete
+        option,
+        parser=_word_parser(option, words),
+        metavar=f"[{'|'.join(words)}]",
+        help=help,
+        autocompletion=completion(words),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +18,14 @@ from dpcli.prepare.series import Series, about_series, choose_series
 from dpcli.prepare.times_beside import with_times
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
+from dpcli.runtime.clips.images import (
+    IMAGE_SUFFIXES,
+    as_shown,
+    one_series,
+    open_image,
+    refuse_twins,
+    require_one_picture,
+)
 from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
@@ -169,12 +175,8 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
             f"{folder}: {first_names(cameras)}: not read; the camera of a clip is assumed to stand still; if it moves, the "
             "object will seem to. Cameras are read from transforms.json, with a time for each frame"
         )
+    refuse_twins(folder, paths, f"choose with --pattern '*{paths[0].suffix}'")
     stems = [path.stem for path in paths]
-    twins = sorted(stem for stem, count in Counter(stems).items() if count > 1)
-    if twins:
-        raise DataError(
-            f"{folder}: {twins[0]!r} is there with two suffixes; choose with --pattern '*{paths[0].suffix}'"
-        )
     numbers = frame_numbers(stems)
     if any(a >= b for a, b in zip(numbers, numbers[1:])):
         numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3

@@ -11,6 +11,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips.container_ends import VIDEO_FORMATS
 from dpcli.runtime.clips.display_matrix import display_matrix
+from dpcli.runtime.clips.video_frames import open_container
 
 _STREAM = re.compile(r"\s*Stream #0:\d+.*?: (Video|Audio|Subtitle|Data|Attachment): (.*)")
 _TITLE = re.compile(r"\s+(?:title|handler_name)\s*: (.*)")
@@ -94,8 +95,7 @@ def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool,
     import av
 
     try:
-        name = "file:" + utf8_path(path, "FFmpeg")
-        with av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace") as container:
+        with open_container(path) as container:
             frames = container.decode(video=place)
             first = next(frames)
             woven = bool(first.interlaced_frame) or (every and any(frame.interlaced_frame for frame in frames))
@@ -115,8 +115,7 @@ def cuts_left(path: Path) -> bool:
     import av
 
     try:
-        name = "file:" + utf8_path(path, "FFmpeg")
-        with av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace") as container:
+        with open_container(path) as container:
             return next(container.decode(video=0)).width != container.streams.video[0].codec_context.width
     except (av.FFmpegError, OSError, ValueError, IndexError, StopIteration):
         return False

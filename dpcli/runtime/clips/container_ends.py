@@ -23,7 +23,13 @@ _ASF_HEAD, _ASF_FILE = bytes.fromhex("3026b2758e66cf11"), bytes.fromhex("a1dcab8
 _ASF_SIZE = 40  # bytes from the file properties' name to the file's size
 _TS_PACKET, _TS_STAMPED = 188, 192
 _OGG_PAGE = 65_307  # bytes at most
-_Y4M_PLANES = {"420": 1.5, "411": 1.5, "422": 2.0, "444": 3.0, "mono": 1.0}  # samples a pixel
+_Y4M_SHRUNK = {
+    "420": (2, 2),
+    "411": (4, 1),
+    "422": (2, 1),
+    "444": (1, 1),
+    "mono": (),
+}  # both planes of color, across and down
 
 
 def ends_early(path: Path) -> bool:
@@ -182,14 +188,14 @@ def _asf(_file: BinaryIO, head: bytes, size: int) -> bool:
 def _yuv4mpeg(file: BinaryIO, head: bytes, size: int) -> bool:
     first = head.split(b"\n", 1)[0]
     found = {word[:1]: word[1:].decode("latin-1") for word in first.split(b" ")[1:] if word}
-    planes = next((n for name, n in _Y4M_PLANES.items() if found.get(b"C", "420").startswith(name)), 0.0)
+    shrunk = next((by for name, by in _Y4M_SHRUNK.items() if found.get(b"C", "420").startswith(name)), None)
     sides = [found.get(key, "") for key in (b"W", b"H")]
-    if not planes or not all(side.isdigit() for side in sides):
+    if shrunk is None or not all(side.isdigit() for side in sides):
         return False
     deep = 2 if re.search(r"(p|mono)(9|1\d)", found.get(b"C", "")) else 1
     width, height = map(int, sides)
-    odd = {1.5: ((width + 1) // 2) * ((height + 1) // 2) * 2, 2.0: (width + 1) // 2 * height * 2}
-    frame = (width * height + odd.get(planes, round((planes - 1) * width * height))) * deep
+    colors = 2 * -(-width // shrunk[0]) * -(-height // shrunk[1]) if shrunk else 0
+    frame = (width * height + colors) * deep
 
     def ends() -> Iterator[int]:
         at = len(first) + 1

@@ -6,6 +6,7 @@ FFmpeg's decoders leave cropping to the program that shows the frames, and PyAV 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -16,6 +17,7 @@ _NONE: Margins = (0, 0, 0, 0)
 _FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _IN_TRACK = (b"mdia", b"minf", b"stbl", b"stsd")
 _ENTRY, _SAMPLE_TABLE = 86, 16  # bytes before the boxes in a video's sample entry, and before those entries
+_EBML = b"\x1aE\xdf\xa3"
 _SEGMENT, _TRACKS, _TRACK, _VIDEO = 0x18538067, 0x1654AE6B, 0xAE, 0xE0
 _CROPS = (0x54CC, 0x54DD, 0x54BB, 0x54AA)
 _MOST = 1 << 16  # bytes of a box, and parts on a level, that are looked at
@@ -26,15 +28,11 @@ def margins(path: Path, place: int, size: tuple[int, int]) -> Margins:
 
     None where the file says nothing, or nothing that leaves a picture.
     """
-    with path.open("rb") as file:
-        end = os.path.getsize(path)
-        head = file.read(12)
-        if head[4:8] in _FIRST:
-            found = _of_boxes(file, end, place, size)
-        elif head[:4] == b"\x1aE\xdf\xa3":
-            found = _of_matroska(file, end, place)
-        else:
-            return _NONE
+    if aperture := entry_box(path, place, (b"clap",)):
+        found = _aperture(aperture, size)
+    else:
+        with path.open("rb") as file:
+            found = _of_matroska(file, os.path.getsize(path), place) if file.read(4) == _EBML else _NONE
     left, right, top, bottom = found
     whole = min(found) >= 0 and left + right < size[0] and top + bottom < size[1]
     return found if whole else _NONE
@@ -83,19 +81,10 @@ def _entries(file: BinaryIO, end: int) -> Iterator[tuple[int, int]]:
         yield entry[1] - 8 + _ENTRY, entry[2]
 
 
-def _of_boxes(file: BinaryIO, end: int, place: int, size: tuple[int, int]) -> Margins:
-    entries = list(_entries(file, end))
-    found = _boxes(file, *entries[place]) if place < len(entries) else ()
-    clap = next((at for name, at, _ in found if name == b"clap"), None)
-    return _aperture(file, clap, size) if clap else _NONE
-
-
-def _aperture(file: BinaryIO, at: int, size: tuple[int, int]) -> Margins:
+def _aperture(data: bytes, size: tuple[int, int]) -> Margins:
     """Returns the margins of a clean aperture: its size and how far its middle lies from the frame's, as fractions."""
-    file.seek(at)
-    data = file.read(32)
-    numbers = [int.from_bytes(data[k : k + 4], "big", signed=True) for k in range(0, len(data), 4)]
-    if len(numbers) < 8 or not all(numbers[1::2]):
+    numbers = struct.unpack_from(">8i", data) if len(data) >= 32 else (0,) * 8
+    if not all(numbers[1::2]):
         return _NONE
     width, height, across, down = (a / b for a, b in zip(numbers[::2], numbers[1::2]))
     left, top = (size[0] - width) / 2 + across, (size[1] - height) / 2 + down

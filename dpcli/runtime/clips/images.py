@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -202,7 +202,7 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
         )
     if len(several) == 1 and len(series) > 1:
         kept = next(iter(several.values()))
-        others = [path.name for path in paths if path not in kept]
+        others = [own[0].name for own in series.values() if len(own) == 1]
         if len(others) >= len(kept):
             return list(paths)
         if not quiet:
@@ -212,6 +212,13 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
             )
         return kept
     return list(paths)
+
+
+def refuse_twins(folder: Path, paths: Sequence[Path], advice: str) -> None:
+    """Raises DataError where two images differ in their suffixes alone, as pictures and their masks do: each would be a frame."""
+    for stem, count in Counter(path.stem for path in paths).items():
+        if count > 1:
+            raise DataError(f"{folder}: {stem!r} is there with two suffixes; {advice}")
 
 
 def _pattern_of_one(first: str, others: list[str]) -> str:

@@ -145,12 +145,20 @@ def _has_alpha(frame) -> bool:
     return any(component.is_alpha for component in frame.format.components)
 
 
-def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
+def open_container(path: Path, **options: str):  # -> av.container.InputContainer
+    """Opens a video file, with options of FFmpeg's demuxer. Raises what PyAV does, DataError for a path that isn't UTF-8."""
     import av
 
     name = "file:" + utf8_path(path, "FFmpeg")
+    options = {"format_whitelist": VIDEO_FORMATS, **options}
+    return av.open(name, options=options, metadata_errors="replace")  # titles may be in any encoding
+
+
+def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
+    import av
+
     try:
-        container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
+        container = open_container(path)
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video ({no_video(path)})") from None
     streams = _streams(container)
@@ -274,15 +282,14 @@ def _declared_and_held(
 
 def _hidden_packets(path: Path) -> int:
     """Returns how many whole packets of the video lie before and after what plays, as an edit list says."""
-    return _packets(path, {"ignore_editlist": "1"}) - _packets(path, {})
+    return _packets(path, ignore_editlist="1") - _packets(path)
 
 
-def _packets(path: Path, options: dict[str, str]) -> int:
+def _packets(path: Path, **options: str) -> int:
     """Returns how many whole packets of the video are shown, by FFmpeg's demuxer with these options."""
     import av
 
-    options = {"format_whitelist": VIDEO_FORMATS, **options}
-    with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
+    with open_container(path, **options) as container:
         packets = container.demux(_streams(container)[0])
         try:
             return sum(1 for one in packets if one.size and not one.is_corrupt and not one.is_discard)
@@ -335,11 +342,9 @@ def _require_known_colors(path: Path, container, stream, frame) -> None:
 
 def _require_one_layer(path: Path, stream) -> None:
     """Raises DataError for HEVC with an alpha layer, as QuickTime writes it: FFmpeg shows what lies below as opaque."""
-    import av
-
     if stream.codec_context.name != "hevc":
         return
-    with av.open("file:" + utf8_path(path, "FFmpeg"), options={"format_whitelist": VIDEO_FORMATS}) as container:
+    with open_container(path) as container:
         packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
         if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
             raise DataError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.segment.pictures import Look
 from dpcli.segment.scene.explain import SENSOR_NEAR
 from dpcli.segment.scene.ground import find_up
@@ -25,7 +26,7 @@ def scene_lines(reader: PartsReader) -> list[str]:
         told = ", ".join(f"{part}: {text}" for part, text in list(zip(objects, speeds))[:_NAMED])
         more = f", and {len(objects) - _NAMED} more" if len(objects) > _NAMED else ""
         sensor = _speed(sequence, said, 0, reader.length_unit)
-        few = f"{len(objects)} moving object{'' if len(objects) == 1 else 's'}"
+        few = counted(len(objects), "moving object")
         lines.append(f"{name}: the sensor moves {sensor}; {few}{f' ({told}{more})' if told else ''}")
     return lines
 

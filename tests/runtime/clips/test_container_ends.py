@@ -54,6 +54,21 @@ def test_a_video_that_lost_its_end_ends_early_and_a_whole_one_does_not(name, tmp
         assert ends_early(path) or boxes, cut
 
 
+@pytest.mark.parametrize(
+    ("tag", "pixels"),
+    [("420jpeg", "yuv420p"), ("411", "yuv411p"), ("422p10", "yuv422p10le"), ("444", "yuv444p"), ("mono", "gray")],
+)
+@pytest.mark.parametrize(("width", "height"), [(70, 65), (71, 32), (72, 33)])
+def test_frames_of_odd_sides_end_where_ffmpeg_has_them_end(tag, pixels, width, height, tmp_path):
+    deep = 2 if "10" in pixels else 1
+    frame = sum(plane.width * plane.height * deep for plane in av.VideoFrame(width, height, pixels).planes)
+    path = tmp_path / "a.y4m"
+    for count, early in ((3 * frame, False), (3 * frame - 1, True)):
+        head = f"YUV4MPEG2 W{width} H{height} F10:1 C{tag}\n".encode()
+        path.write_bytes((head + 3 * (b"FRAME\n" + bytes(frame)))[: len(head) + 18 + count])
+        assert ends_early(path) == early
+
+
 @pytest.mark.parametrize("name", ["a.ts", "a.mkv", "a.flv", "a.mp4", "a.y4m"])
 def test_fewer_frames_are_an_error_or_a_warning(name, tmp_path, monkeypatch):
     path = write(tmp_path / name, *CONTAINERS[name])

@@ -97,6 +97,16 @@ def test_pictures_that_stay_in_theora_end_no_clip(pictures, tmp_path):
         assert read[at, 28, :, 0].argmax() in range(6 + 4 * frame, 30 + 4 * frame)
 
 
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_a_title_in_any_encoding_hinders_nothing(codec, pictures, tmp_path):
+    """Of HEVC, whose file is opened once more for its layers, as well."""
+    path = film(
+        pictures, tmp_path / "k.mkv", "-pix_fmt", "yuv420p", "-c:v", codec, "-metadata", "title=caf_ in Latin-1"
+    )
+    path.write_bytes(path.read_bytes().replace(b"caf_", b"caf\xe9"))
+    assert look_at_video(path).count == COUNT
+
+
 @pytest.mark.parametrize("name", ["h264.mp4", "ffv1.avi"])
 def test_without_alpha_everything_is_opaque(pictures, tmp_path, name):
     words = {"h264.mp4": ("-pix_fmt", "yuv420p"), "ffv1.avi": ("-c:v", "ffv1", "-pix_fmt", "bgr0")}[name]

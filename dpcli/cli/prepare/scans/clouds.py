@@ -10,6 +10,7 @@ import typer
 
 from dpcli.cli.help_groups import LABELS
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
+from dpcli.cli.prepare.lists import words
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
 
@@ -62,7 +63,7 @@ class CloudUnits:
     @property
     def kept(self) -> tuple[str, ...]:
         """Returns the names of the columns to keep, in their order, each once."""
-        return tuple(dict.fromkeys(name.strip() for name in self.keep_fields.split(",") if name.strip()))
+        return tuple(dict.fromkeys(words(self.keep_fields)))
 
 
 @dataclass(frozen=True)

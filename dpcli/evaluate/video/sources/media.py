@@ -17,7 +17,14 @@ from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image, require_one_picture
+from dpcli.runtime.clips.images import (
+    IMAGE_SUFFIXES,
+    as_shown,
+    one_series,
+    open_image,
+    refuse_twins,
+    require_one_picture,
+)
 from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
@@ -57,7 +64,9 @@ class FolderSource(Source):
 
 def _images_in(folder: Path) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-    return one_series(folder, in_order(sorted(found, key=_numbers_in_name)))
+    images = one_series(folder, in_order(sorted(found, key=_numbers_in_name)))
+    refuse_twins(folder, images, "move those of one kind into a folder of their own")
+    return images
 
 
 def _numbers_in_name(path: Path) -> tuple:

@@ -56,6 +56,15 @@ def test_folders_of_views_match_by_name(tmp_path: Path, truth: Path, said: Path)
     assert "reference" not in [view.title for view in tests.views]
 
 
+def test_masks_beside_the_pictures_are_not_compared_as_frames(tmp_path: Path) -> None:
+    """Of the same names but for their suffixes; the mean was one over pictures and masks."""
+    write_folder(tmp_path / "f", clip()[0], "{:03d}.png")
+    for path in list((tmp_path / "f").iterdir()):
+        Image.new("L", (WIDTH, HEIGHT)).save(path.with_suffix(".bmp"))
+    with pytest.raises(DataError, match="'000' is there with two suffixes; move those of one kind into a folder"):
+        open_source(tmp_path / "f")
+
+
 def test_a_lone_folder_is_the_reference(tmp_path: Path, truth: Path) -> None:
     flat = write_folder(tmp_path / "flat", clip()[0])
     with pytest.raises(DataError, match="flat: has no view '1', '2', '3' of .*truth.h5; .*--intersect"):
