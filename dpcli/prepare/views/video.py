@@ -98,14 +98,16 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
+    square = (options.size, options.size)
+    sizes = [square if options.recenter else size, *(image_size(paths[0]) for paths in given)]
     header = ViewsHeader(
         options.name or clip_name(path),
-        np.stack([pinhole(camera.fovy, options.size, options.size) for camera in all_cameras]),
+        np.stack([_lens(camera.fovy, own, options.size) for camera, own in zip(all_cameras, sizes, strict=True)]),
         np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
         _times(frames, wanted, options.fps),
         ["reference", *(camera.role for camera in cameras)],
         0,
-        (options.size, options.size),
+        square,
     )
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
@@ -116,6 +118,11 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
                 yield view, row, rgba
 
     return Clip(header, pictures)
+
+
+def _lens(fovy: float, picture: tuple[int, int], size: int) -> np.ndarray:
+    """Returns intrinsics f64 (3,3) of the square around a whole picture (width, height) whose own height the angle spans."""
+    return whole_picture(*picture).intrinsics(pinhole(fovy, *picture), size)
 
 
 def clip_name(path: Path) -> str:
