@@ -99,10 +99,20 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
     square = (options.size, options.size)
-    sizes = [square if options.recenter else size, *(image_size(paths[0]) for paths in given)]
+    if (
+        options.recenter and not given
+    ):  # nothing else tells where the camera stood: the object is in the middle of its picture
+        lenses = [pinhole(options.camera().fovy, *square)]
+    else:  # whoever filmed or generated further views started from whole pictures
+        sizes = [size, *(image_size(paths[0]) for paths in given)]
+        crops = [crop, *(whole_picture(*own) for own in sizes[1:])]
+        lenses = [
+            own_crop.intrinsics(pinhole(camera.fovy, *own), options.size)
+            for camera, own, own_crop in zip(all_cameras, sizes, crops, strict=True)
+        ]
     header = ViewsHeader(
         options.name or clip_name(path),
-        np.stack([_lens(camera.fovy, own, options.size) for camera, own in zip(all_cameras, sizes, strict=True)]),
+        np.stack(lenses),
         np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
         _times(frames, wanted, options.fps),
         ["reference", *(camera.role for camera in cameras)],
@@ -118,11 +128,6 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
                 yield view, row, rgba
 
     return Clip(header, pictures)
-
-
-def _lens(fovy: float, picture: tuple[int, int], size: int) -> np.ndarray:
-    """Returns intrinsics f64 (3,3) of the square around a whole picture (width, height) whose own height the angle spans."""
-    return whole_picture(*picture).intrinsics(pinhole(fovy, *picture), size)
 
 
 def clip_name(path: Path) -> str:

@@ -508,9 +508,10 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
 
 
+@pytest.mark.parametrize("recenter", [False, True])
 @pytest.mark.parametrize("shape", [(32, 32), (61, 40), (40, 61)])
-def test_the_angle_of_a_camera_spans_its_own_pictures_height(tmp_path, shape):
-    """A small ball is seen where each camera's intrinsics in the file say, of pictures higher or wider than long."""
+def test_the_angle_of_a_camera_spans_its_own_whole_pictures_height(tmp_path, shape, recenter):
+    """A small ball is seen where each camera's intrinsics in the file say, of pictures of any shape, and where the first is cropped."""
     ball, (width, height) = np.array([0.35, -0.2, 0.1]), shape
     entries = [
         {"azimuth": 0, "elevation": 0},
