@@ -98,26 +98,14 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
-    square = (options.size, options.size)
-    if (
-        options.recenter and not given
-    ):  # nothing else tells where the camera stood: the object is in the middle of its picture
-        lenses = [pinhole(options.camera().fovy, *square)]
-    else:  # whoever filmed or generated further views started from whole pictures
-        sizes = [size, *(image_size(paths[0]) for paths in given)]
-        crops = [crop, *(whole_picture(*own) for own in sizes[1:])]
-        lenses = [
-            own_crop.intrinsics(pinhole(camera.fovy, *own), options.size)
-            for camera, own, own_crop in zip(all_cameras, sizes, crops, strict=True)
-        ]
     header = ViewsHeader(
         options.name or clip_name(path),
-        np.stack(lenses),
+        np.stack(_lenses(all_cameras, crop, size, given, options)),
         np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
         _times(frames, wanted, options.fps),
         ["reference", *(camera.role for camera in cameras)],
         0,
-        square,
+        (options.size, options.size),
     )
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
@@ -128,6 +116,24 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
                 yield view, row, rgba
 
     return Clip(header, pictures)
+
+
+def _lenses(
+    cameras: list[OrbitCamera], crop: Crop, size: tuple[int, int], given: list[list[Path]], options: VideoOptions
+) -> list[np.ndarray]:
+    """Returns intrinsics f64 (3,3) of the reference, which was cropped from pictures of `size`, and of the given views.
+
+    A vertical angle is that of whole pictures: whoever filmed or generated further views started from these. Without such
+    views nothing tells where the camera of a recentered clip looked, which then is at the middle of the square.
+    """
+    if options.recenter and not given:
+        return [pinhole(cameras[0].fovy, options.size, options.size)]
+    sizes = [size, *(image_size(paths[0]) for paths in given)]
+    crops = [crop, *(whole_picture(*own) for own in sizes[1:])]
+    return [
+        own.intrinsics(pinhole(camera.fovy, *whole), options.size)
+        for camera, own, whole in zip(cameras, crops, sizes, strict=True)
+    ]
 
 
 def clip_name(path: Path) -> str:
