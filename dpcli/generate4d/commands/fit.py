@@ -22,6 +22,7 @@ from dpcli.generate4d.out.fit_curves import draw_curves
 from dpcli.generate4d.out.preview import write_preview
 from dpcli.generate4d.out.scene_writer import to_scene
 from dpcli.generate4d.priors.interface import Prior
+from dpcli.generate4d.scene.initialization import check_cameras
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.shape.model_file import find_shape_model
@@ -71,6 +72,8 @@ def fit_scene(
             return
         targets = _load(path, config, supervision)
         targets.check_world(views)
+        if targets.num_views > 1:
+            check_cameras(targets, views)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
         prior, shape = (
             _load_prior(supervision, targets, device),

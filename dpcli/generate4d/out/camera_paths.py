@@ -47,14 +47,24 @@ class Lens:
         return tuple(default if value is None else value for value, default in zip(asked, reference))
 
     def sensor(self, scene: GaussianScene) -> tuple[np.ndarray, tuple[int, int]]:
-        """Returns intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`; centered with `fovy`."""
+        """Returns intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`, or with `fovy`.
+
+        Cameras on an orbit look at the origin, which is to be in the middle of their pictures wherever the reference has it.
+        """
         width, height = scene.size
         zoom = self.size / max(width, height) if self.size else 1.0
         size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
         if self.fovy is not None:
             return pinhole(self.fovy, *size), size
-        scaled = np.diag([size[0] / width, size[1] / height, 1.0]) @ scene.camera_intrinsics[scene.reference]
-        return scaled, size
+        focal = scene.camera_intrinsics[scene.reference][[0, 1], [0, 1]] * size / scene.size
+        return np.array([[focal[0], 0, 0.5 * size[0]], [0, focal[1], 0.5 * size[1]], [0, 0, 1.0]]), size
+
+    def reference(self, scene: GaussianScene) -> tuple[np.ndarray, tuple[int, int]]:
+        """Returns the reference camera's own intrinsics f64 (3,3), scaled to `size`, and the size (width, height)."""
+        _, size = self.sensor(scene)
+        return np.diag([size[0] / scene.size[0], size[1] / scene.size[1], 1.0]) @ scene.camera_intrinsics[
+            scene.reference
+        ], size
 
 
 def own_rate(scene: GaussianScene) -> float:
@@ -95,7 +105,7 @@ def plan_shots(
     """
     rate = fps or default_rate(scene, path)
     count = frames or _usual_count(scene, path, rate, time is not None)
-    intrinsics, size = lens.sensor(scene) if path != "reference" else Lens(size=lens.size).sensor(scene)
+    intrinsics, size = lens.sensor(scene) if path != "reference" else lens.reference(scene)
     times = [time] * count if time is not None else instants(scene, count, rate)
     poses = _poses(scene, path, lens, count)
     return [Shot(float(instant), pose, intrinsics, size) for instant, pose in zip(times, poses, strict=True)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,8 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
     Raises DataError when it can't be written or gsply is not installed.
     """
     gsply = _gsply(path)
-    write_whole(path, _written(lambda place: gsply.plywrite(place, _data(gsply, splats), compressed=True), ".ply"))
+    # not its plywrite, which imports torch and its compiler to look at what it was given
+    write_whole(path, gsply.compress_to_bytes(_data(gsply, splats)))
 
 
 def write_spz(path: Path, splats: Splats) -> None:
@@ -46,8 +46,11 @@ def write_spz(path: Path, splats: Splats) -> None:
             f"{path}: .spz holds sizes of {bounds[0]:.2g} to {bounds[1]:.3g}, but the Gaussians have {own[0]:.2g} to {own[1]:.3g};"
             " write --as compressed.ply or ply"
         )
-    packed = _written(lambda place: gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits), ".spz")
-    write_whole(path, gzip.compress(gzip.decompress(packed), mtime=0))  # equal scenes give equal bytes
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "scene.spz"
+        gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits)
+        packed = gzip.decompress(place.read_bytes())
+    write_whole(path, gzip.compress(packed, mtime=0))  # equal scenes give equal bytes
 
 
 def _gsply(path: Path) -> Any:
@@ -65,11 +68,3 @@ def _data(gsply: Any, splats: Splats) -> Any:
         None if values is None else np.ascontiguousarray(values, np.float32) for values in arrays
     )
     return gsply.GSData.from_arrays(means, scales, quaternions, opacities, colors, terms, format="ply")
-
-
-def _written(write: Callable[[Path], None], suffix: str) -> bytes:
-    """Returns the bytes of the file that a function writes at a place of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / f"scene{suffix}"
-        write(place)
-        return next(Path(folder).iterdir()).read_bytes()

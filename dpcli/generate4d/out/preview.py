@@ -74,12 +74,14 @@ def write_preview(fitted: Model4D | GaussianScene, targets: Targets, path: Path)
         instants = _instants_of_model(fitted, targets.times()[frames])
     size, color = (truth.shape[2], truth.shape[1]), instants.color.expand(len(frames), -1, -1)
     parts, weights = part_colors(instants.part.cpu().numpy()), weight_colors(instants.weight.cpu().numpy())
+    centered = intrinsics.clone()  # cameras aside look at the origin, wherever the reference has it in its picture
+    centered[:, :2, 2] = 0.5 * torch.tensor(size)
     rows = [
         truth[..., :3] + 1 - truth[..., 3:],
         _draw(instants, color, poses, intrinsics, size),
         _draw(instants, torch.from_numpy(parts / 255), poses, intrinsics, size),
         _draw(instants, torch.from_numpy(weights / 255), poses, intrinsics, size),
-        *(_draw(instants, color, _aside(targets, turn).expand(len(frames), 4, 4), intrinsics, size) for turn in _SIDES),
+        *(_draw(instants, color, _aside(targets, turn).expand(len(frames), 4, 4), centered, size) for turn in _SIDES),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
     save_picture((sheet.clamp(0, 1) * 255).round().byte().numpy(), path)

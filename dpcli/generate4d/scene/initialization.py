@@ -6,6 +6,8 @@ them flat. A shape prior, at least the inflated silhouette, says where the surfa
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,10 +15,17 @@ from torch import Tensor
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FitConfig
 from dpcli.generate4d.shape.guidance import ShapeGuidance, sample_surface
+from dpcli.generate4d.shape.layers import Camera
 from dpcli.generate4d.shape.silhouette import Inflated, ball_thickness
 from dpcli.generate4d.targets import Targets
+from dpcli.runtime.progress import log
 
 _ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
+_RAYS, _STEPS = (
+    400,
+    192,
+)  # pixels of a silhouette, and places on the ray of each, that other silhouettes are asked about
+_SHARED = 0.95  # of a silhouette, at least, lies within all others where their cameras are right
 
 
 def choose_start(config: FitConfig, targets: Targets) -> str:
@@ -52,6 +61,48 @@ def first_points(
         cameras = targets.intrinsics[shown], targets.world_to_camera[shown]
         points, colors = carve_hull(pictures, *cameras, config.gaussians, rng)
     return torch.from_numpy(points), torch.from_numpy(colors)
+
+
+def check_cameras(targets: Targets, where: object) -> None:
+    """Warns of views whose silhouettes contradict one another, as those of wrong, mirrored or exchanged cameras do."""
+    shares = shared_silhouettes(targets, frame := targets.widest_frame())
+    if np.nanmin(np.append(shares, 1.0)) < _SHARED:
+        names = ["reference" if view == targets.reference else f"train{view}" for view in range(len(shares))]
+        found = ", ".join(f"{name} {share:.0%}" for name, share in zip(names, shares) if np.isfinite(share))
+        log.warn(
+            f"{where}: the views contradict one another: the shares of the silhouettes in frame {frame} that the other views"
+            f" leave possible are {found}, expected nearly 100%; the scene will be blurred. Check the cameras (mirrored? in"
+            " another order? another field of view?) and that all views show the same moment"
+        )
+
+
+def shared_silhouettes(targets: Targets, frame: int) -> np.ndarray:  # [V]
+    """Returns the share of each view's silhouette whose rays pass, near the object, through all other silhouettes at once.
+
+    Silhouettes are taken one pixel wider. What lies outside a view's picture isn't contradicted by it; a view that shows
+    nothing isn't asked, and has NaN.
+    """
+    from scipy import ndimage
+
+    masks = targets.pictures[:, frame, ..., 3].float().numpy() > 0.5
+    shown = [view for view, mask in enumerate(masks) if mask.any()]
+    wide = ndimage.binary_dilation(masks, np.ones((1, 3, 3)))
+    asked = np.stack([wide, np.ones_like(wide)], -1)
+    reach = max(replace(targets, reference=view).object_reach()[0] for view in shown) if shown else 0.0
+    shares = np.full(len(masks), np.nan)
+    for view in shown:
+        camera = Camera(targets.intrinsics[view], targets.world_to_camera[view])
+        pixels = np.argwhere(masks[view])
+        row, column = pixels[:: max(1, len(pixels) // _RAYS)].T[..., None]
+        depth = camera.distance + reach * np.linspace(-1, 1, _STEPS)
+        points = camera.to_world(camera.pixel_points(row, column, np.broadcast_to(depth, (len(row), _STEPS))))
+        inside = np.ones(points.shape[:2], bool)
+        for other in shown:
+            matrix, pose = targets.intrinsics[other], targets.world_to_camera[other]
+            values, _ = _sample_picture(asked[other], points.reshape(-1, 3), matrix, pose)
+            inside &= (values[:, 0] >= values[:, 1]).reshape(inside.shape)  # both are 0 outside the picture
+        shares[view] = inside.any(1).mean()
+    return shares
 
 
 def sample_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:

@@ -83,6 +83,11 @@ class VideoOptions:
             raise UsageError("--views-cameras describes the cameras of --views FOLDER; give both")
         matting.named_background(self.background)
 
+    @property
+    def crops(self) -> bool:
+        """Returns whether the clip is cropped around the object; beside other views it isn't, since a crop moves the camera."""
+        return self.recenter and self.views is None
+
     def camera(self) -> OrbitCamera:
         """Returns the reference camera: azimuth 0."""
         return OrbitCamera(0.0, float(np.deg2rad(self.elevation)), self.radius, float(np.deg2rad(self.fovy)))
@@ -98,9 +103,10 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
+    sizes = [(options.size, options.size) if options.crops else size, *(image_size(paths[0]) for paths in given)]
     header = ViewsHeader(
         options.name or clip_name(path),
-        np.stack([pinhole(camera.fovy, options.size, options.size) for camera in all_cameras]),
+        np.stack([_lens(camera.fovy, own, options.size) for camera, own in zip(all_cameras, sizes, strict=True)]),
         np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
         _times(frames, wanted, options.fps),
         ["reference", *(camera.role for camera in cameras)],
@@ -116,6 +122,11 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
                 yield view, row, rgba
 
     return Clip(header, pictures)
+
+
+def _lens(fovy: float, picture: tuple[int, int], size: int) -> np.ndarray:
+    """Returns intrinsics f64 (3,3) of the square around a whole picture (width, height) whose own height the angle spans."""
+    return whole_picture(*picture).intrinsics(pinhole(fovy, *picture), size)
 
 
 def clip_name(path: Path) -> str:
@@ -227,7 +238,9 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         )
     if len(good) == 1:
         log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
-    crop = crop_around(union(boxes), options.border) if options.recenter else whole_picture(width, height)
+    crop = crop_around(union(boxes), options.border) if options.crops else whole_picture(width, height)
+    if options.recenter and not options.crops:
+        log.info(f"{frames.path}: not cropped, so that its camera stays as the other views' cameras expect it")
     if crop.side < options.size / 1.5:
         log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
     log.info(

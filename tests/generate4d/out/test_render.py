@@ -88,6 +88,22 @@ def test_size_and_field_of_view(scene):
         assert shot.intrinsics[1, 1] == pytest.approx(focal)
 
 
+@pytest.mark.parametrize("path", ["turntable", "orbit", "swing", "fixed"])
+def test_an_orbit_keeps_the_object_in_the_middle_whatever_the_reference_camera_sees_there(scene, path):
+    """The reference has an oblong sensor, of which a corner was cut out, and doesn't look at the origin."""
+    lens = np.array([[40.0, 0, 5], [0, 50, 33], [0, 0, 1]])
+    pose = scene.camera_world_to_camera[0].copy()
+    pose[:2, 3] = [0.8, 0.2]
+    cameras = {"camera_intrinsics": lens[None], "camera_world_to_camera": pose[None]}
+    other = replace(scene, size=(48, 40), reference=0, **cameras)
+    for shot in plan_shots(other, path, Lens(size=96), frames=6):
+        origin = shot.intrinsics @ shot.world_to_camera[:3, 3]
+        np.testing.assert_allclose(origin[:2] / origin[2], [48, 40], atol=1e-9)
+        assert shot.intrinsics[[0, 1], [0, 1]] == pytest.approx([80, 100])
+    own = plan_shots(other, "reference", Lens(size=96), frames=1)[0]
+    np.testing.assert_allclose(own.intrinsics, np.diag([2, 2, 1]) @ lens)
+
+
 def test_a_still_instant_and_a_scene_of_one_frame(scene):
     assert [shot.time for shot in plan_shots(scene, "fixed", time=0.3)] == [0.3]
     assert {shot.time for shot in plan_shots(scene, "turntable", time=0.3)} == {0.3}

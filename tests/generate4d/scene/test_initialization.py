@@ -11,7 +11,7 @@ import torch
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.scene.canonical_gaussians import NAMES, CanonicalGaussians
-from dpcli.generate4d.scene.initialization import carve_hull, first_points, sample_sphere
+from dpcli.generate4d.scene.initialization import carve_hull, check_cameras, first_points, sample_sphere
 from dpcli.generate4d.scene.losses import picture_loss, thickness_loss
 from dpcli.generate4d.shape.silhouette import ball_thickness
 from dpcli.generate4d.targets import Targets
@@ -71,6 +71,46 @@ def test_a_view_that_the_object_has_left_carves_nothing(alpha, views):
         camera = points.numpy() @ pose[:3, :3].T + pose[:3, 3]
         seen = np.hypot(*(camera[:, :2] / camera[:, 2:] * targets.intrinsics[0, 0, 0]).T)
         assert (seen.max() < 16) == (clear == 1)
+
+
+def _balls(seed: int, poses: np.ndarray, lenses: np.ndarray, size: int) -> torch.Tensor:
+    """Silhouettes (V,1,size,size,4) of five balls of random places and sizes, by the distance of each pixel's ray."""
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.uniform(-0.45, 0.45, (5, 3)), rng.uniform(0.1, 0.25, 5)
+    row, column = np.indices((size, size)) + 0.5
+    pictures = []
+    for pose, lens in zip(poses, lenses):
+        rays = np.stack([(column - lens[0, 2]) / lens[0, 0], (row - lens[1, 2]) / lens[1, 1], np.ones_like(row)], -1)
+        places = centers @ pose[:3, :3].T + pose[:3, 3]
+        along = rays @ places.T / np.linalg.norm(rays, axis=-1, keepdims=True)  # [H, W, 5]
+        alpha = ((places**2).sum(1) - along**2 < radii**2).any(-1)
+        pictures.append(np.repeat(alpha[..., None], 4, -1)[None])
+    return torch.from_numpy(np.stack(pictures)).half()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("wrong", ["", "mirrored", "exchanged", "angle of view", "upside down"])
+def test_views_of_wrong_cameras_contradict_one_another(wrong, seed, capsys):
+    """Right are cameras of unequal lenses, too, with a picture that cuts the object, and one that shows nothing of it."""
+    angles = np.deg2rad([(0, 0), (60, 20), (150, -10), (220, 30), (300, 10)])
+    poses = np.stack([orbit_pose(azimuth, elevation) for azimuth, elevation in angles])
+    lenses = np.stack([pinhole(np.deg2rad(angle), 64, 64) for angle in (49, 60, 45, 55, 49)])
+    lenses[1, 0, 0] *= 1.3
+    lenses[2, 0, 2], lenses[3, 1, 2] = 4, 40
+    pictures = _balls(seed, poses, lenses, 64)
+    pictures[4] *= 1e-4
+    if wrong == "mirrored":
+        poses = np.stack([orbit_pose(-azimuth, elevation) for azimuth, elevation in angles])
+    elif wrong == "upside down":
+        poses = np.stack([orbit_pose(azimuth, -elevation) for azimuth, elevation in angles])
+    elif wrong == "exchanged":
+        poses = poses[[0, 2, 1, 3, 4]]
+    elif wrong:
+        lenses[1:, [0, 1], [0, 1]] *= 1.6
+    check_cameras(Targets("balls", pictures, lenses, poses, np.zeros(1), 0), "balls.h5")
+    said = capsys.readouterr().err
+    assert ("balls.h5: the views contradict one another" in said) == bool(wrong), said
+    assert "nan" not in said
 
 
 def test_two_views_at_a_right_angle_make_a_rod_round_not_square():

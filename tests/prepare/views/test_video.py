@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError, UsageError
-from dpcli.ops.cameras import orbit_of
+from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import read_cameras
@@ -506,6 +506,32 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     assert clip.header.role == ["reference", "train", "test"]
     assert orbit_of(clip.header.world_to_camera[1])[2] == pytest.approx(3)
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
+
+
+@pytest.mark.parametrize("recenter", [False, True])
+@pytest.mark.parametrize("shape", [(32, 32), (61, 40), (40, 61)])
+def test_the_angle_of_a_camera_spans_its_own_whole_pictures_height(tmp_path, shape, recenter):
+    """A small ball is seen where each camera's intrinsics in the file say, of pictures of any shape, and where the first is cropped."""
+    ball, (width, height) = np.array([0.35, -0.2, 0.1]), shape
+    entries = [
+        {"azimuth": 0, "elevation": 0},
+        {"azimuth": 90, "elevation": 20, "fovy": 35},
+        {"azimuth": 200, "elevation": -30},
+    ]
+    poses = [orbit_pose(*np.deg2rad([entry["azimuth"], entry["elevation"]])) for entry in entries]
+    folders = [tmp_path / "ref", tmp_path / "views" / "view_0", tmp_path / "views" / "view_1"]
+    for entry, pose, folder in zip(entries, poses, folders):
+        x, y, depth = pose[:3, :3] @ ball + pose[:3, 3]
+        focal = 0.5 * height / np.tan(0.5 * np.deg2rad(entry.get("fovy", 50)))
+        save(folder, [disc((width / 2 + focal * x / depth, height / 2 + focal * y / depth), 3, shape)])
+    (tmp_path / "c.json").write_text(json.dumps(entries[1:]))
+    options = VideoOptions(
+        size=64, fovy=50, recenter=False, views=tmp_path / "views", views_cameras=tmp_path / "c.json"
+    )
+    clip = video_clip(folders[0], options)
+    for view, picture in enumerate(read(clip).values()):
+        seen = clip.header.intrinsics[view] @ (poses[view][:3, :3] @ ball + poses[view][:3, 3])
+        np.testing.assert_allclose(centroid(picture), seen[:2] / seen[2], atol=0.1)
 
 
 @pytest.mark.parametrize("scale, told", [(np.pi / 180, True), (1, False)])

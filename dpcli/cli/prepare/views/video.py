@@ -21,7 +21,10 @@ class PictureOptions:
     frames: FramesAtMost = 32
     size: PictureSize = 512
     recenter: Annotated[
-        bool, typer.Option("--recenter/--no-recenter", help="One crop around the object for the whole clip.")
+        bool,
+        typer.Option(
+            "--recenter/--no-recenter", help="One crop around the object for the whole clip; never with --views."
+        ),
     ] = True
     border: Border = 0.2
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second. Default: the file's, else 16.")] = None
