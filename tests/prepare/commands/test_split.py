@@ -165,7 +165,9 @@ def test_into_one_file_with_new_splits(whole, tmp_path):
 @pytest.mark.parametrize("output", ["d", "new.h5"])
 def test_the_same_command_again_finds_its_work_done(whole, tmp_path, monkeypatch, words, output):
     monkeypatch.chdir(tmp_path)
-    Path("list.csv").write_text("name,split\n" + "".join(f"s{k:02},{'train' if k % 2 else 'test'}\n" for k in range(12)))
+    Path("list.csv").write_text(
+        "name,split\n" + "".join(f"s{k:02},{'train' if k % 2 else 'test'}\n" for k in range(12))
+    )
     command = ("prepare", "split", whole.name, "-o", output, *words)
     first, again = dpc(*command), dpc(*command)
     assert first.returncode == again.returncode == 0 and first.stdout == again.stdout
