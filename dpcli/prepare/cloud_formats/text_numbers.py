@@ -309,15 +309,28 @@ def _with_units(table: TextTable) -> TextTable:
     axes = named_axes(table.path, table.names) if row else None
     if not row or not axes:
         return table
-    units = dict(enumerate(names_in(row[1].strip(_EDGES), table.delimiter or delimiter_of(row[1]))))
-    told = {unit_of(f"x {units.get(place, '')}") for place in axes[0]}
+    units = names_in(row[1].strip(_EDGES), table.delimiter or delimiter_of(row[1]))
+    told = {unit_of(f"x {units[place] if place < len(units) else ''}") for place in axes[0]}
     if len(told) != 1 or not (unit := told.pop()):
         return table
     names = tuple(f"{name} [{unit}]" if place in axes[0] else name for place, name in enumerate(table.names))
-    scales = {name: seconds_in_brackets(" ".join(words_of(units.get(place, "")))) for place, name in enumerate(names)}
-    seconds = tuple((name, scale) for name, scale in scales.items() if scale)
-    number = table.first_line + row[0].count("\n")
-    return replace(table, names=names, body=table.body[row.end() :], first_line=number, seconds=seconds)
+    return replace(
+        table,
+        names=names,
+        body=table.body[row.end() :],
+        first_line=table.first_line + row[0].count("\n"),
+        seconds=seconds_by_name(names, units),
+    )
+
+
+def seconds_by_name(names: Sequence[str], units: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Returns the columns of which a row of units tells one of time, with the seconds of that.
+
+    >>> seconds_by_name(["frame", "time", "x", "dwell"], ["-", "[ms]", "mm"])
+    (('time', 0.001),)
+    """
+    found = ((name, seconds_in_brackets(" ".join(words_of(unit)))) for name, unit in zip(names, units))
+    return tuple((name, seconds) for name, seconds in found if seconds)
 
 
 def _with_row_names(table: TextTable, rows: list[tuple[int, str]]) -> TextTable:
