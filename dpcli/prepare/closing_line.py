@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.prepare.median import median
 from dpcli.store import CloudsReader
 
@@ -26,7 +27,10 @@ def closing_lines(reader: CloudsReader, notes: Mapping[str, int]) -> list[str]:
     if not len(reader):
         return []
     said = [*_lengths(reader), _frames(reader), *_tracks(reader)]
-    said += [f"{count} {what}" for what, count in sorted(notes.items()) if what.endswith("dropped") and count]
+    for what, count in sorted(notes.items()):
+        if what.endswith("dropped") and count:
+            plural, told = what.split(" ", 1)
+            said.append(f"{counted(count, plural.removesuffix('s'))} {told}")
     return [", ".join(said), *_shifts(reader)]
 
 

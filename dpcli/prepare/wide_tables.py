@@ -15,7 +15,7 @@ from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, one_unit, unit_of, words_of
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
-from dpcli.prepare.cloud_formats.text_numbers import TextTable, delimiter_of, names_in
+from dpcli.prepare.cloud_formats.text_numbers import TextTable, delimiter_of, names_in, seconds_by_name
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.scans.frames_of_tables import Rows
 from dpcli.text_files import decode_text
@@ -94,11 +94,12 @@ def read_wide(path: Path) -> WideTable:
         while start < len(lines) and not lines[start].strip():
             start += 1
         below = names_in(lines[start].strip(" \r\0"), None) if start < len(lines) else []
+        seconds: tuple[tuple[str, float], ...] = ()
         if units := {unit_of(f"x {word}") for word in below if word} - {""}:
-            unit, start = one_unit(units), start + 1
+            unit, start, seconds = one_unit(units), start + 1, seconds_by_name(named, below)
         body = "\n".join(lines[start:])
         delimiter = delimiter_of(body.split("\n", 1)[0].strip(" \r"))
-        table = TextTable(path, named, body, start + 1, delimiter)
+        table = TextTable(path, named, body, start + 1, delimiter, seconds=seconds)
         counts = [int(word) for word in _told_above(head[:number], _COUNT) if word.isdecimal()]
         return replace(_checked(path, table, told, unit), missing=max(max(counts, default=0) - table.rows, 0))
     raise DataError(f"{path}: --track columns: no columns of several points, such as hip_x, hip_y, hip_z, knee_x, ...")

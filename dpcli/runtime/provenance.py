@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shlex
 import sys
@@ -42,8 +43,12 @@ def file_digest(path: str | Path) -> str:
 
 
 def record(config: dict, seed: int, inputs: dict[str, str | Path] | None = None) -> dict:
-    """Returns one provenance entry: command, resolved options, seed, version, and the digest of every input file."""
-    entry = {"command": command_line(), "config": config, "seed": int(seed), "version": __version__}
+    """Returns one provenance entry: command, resolved options, seed, version, and the digest of every input file.
+
+    The options are as a file will have them, tuples as lists, so that the same work run again equals what was stored.
+    """
+    stored = json.loads(json.dumps(config))
+    entry = {"command": command_line(), "config": stored, "seed": int(seed), "version": __version__}
     if inputs:
         entry["inputs"] = {role: file_digest(path) for role, path in inputs.items()}
     return entry

@@ -87,7 +87,7 @@ def _why_not(videos: list[_Video], labels: np.ndarray | None) -> str:
         return f"is {values[0]:g} everywhere"
     rules: tuple[tuple[Callable[[list[_Video]], bool], str], ...] = (
         (_numbers_rows, "numbers the points of a frame"),
-        (_is_a_clock, "rises with time"),
+        (_is_a_clock, "rises or falls with time"),
         (_names_videos, "tells which video it is"),
     )
     for rule, why in rules:

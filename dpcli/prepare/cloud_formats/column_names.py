@@ -16,6 +16,17 @@ _SPELLED = {
     **{word: "um" for word in ("um", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres")},
     **{"km": "km", "dm": "dm"},
 }
+_UNITS_OF_TIME = (
+    (1.0, "s sec secs second seconds"),
+    (1e-3, "ms msec msecs milli millis millisec millisecs millisecond milliseconds"),
+    (1e-6, "us usec usecs micro micros microsec microsecs microsecond microseconds"),
+    (1e-9, "ns nsec nsecs nano nanos nanosec nanosecs nanosecond nanoseconds"),
+    (60.0, "minute minutes"),
+    (3600.0, "hour hours hr hrs"),
+    (86_400.0, "days"),
+)
+SECONDS = {word: size for size, words in _UNITS_OF_TIME for word in words.split()}
+_IN_BRACKETS = {"min": 60.0, "mins": 60.0, "h": 3600.0, "d": 86_400.0, "day": 86_400.0}  # other things elsewhere
 _ABOUT_POINTS = frozenset(
     "point points pt pos position coord coords coordinate coordinates cartesian cart field fields loc location data p"
     " xyz local world global axis vertex koord koordinate koordinaten coordonnée coordonnées".split()
@@ -92,6 +103,15 @@ def unit_of(name: str) -> str:
     if re.search(r"[\[(]in[\])]$", name.strip()):  # without brackets a word like others
         return "in"
     return _SPELLED.get(words[-1], "") if len(words) > 1 else ""
+
+
+def seconds_in_brackets(unit: str) -> float:
+    """Returns how many seconds a unit of time is that stands in brackets, or in a row of units; 0 of what is none.
+
+    >>> seconds_in_brackets("ms"), seconds_in_brackets("min"), seconds_in_brackets("mm")
+    (0.001, 60.0, 0.0)
+    """
+    return _IN_BRACKETS.get(unit, SECONDS.get(unit, 0.0))
 
 
 def unit_of_comments(lines: Iterable[str]) -> str:

@@ -14,7 +14,14 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
-from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, find_trios, unit_of, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import (
+    ROWS_ARE_FRAMES,
+    find_trios,
+    seconds_in_brackets,
+    unit_of,
+    unit_of_comments,
+    words_of,
+)
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 from dpcli.text_files import decode_text
 
@@ -46,7 +53,8 @@ class TextTable:
 
     body: the text from the first row on; first_line: which line of the file that is, from 1. delimiter: None for blanks.
     limit: rows that count, None for all. header: the line of the names, which files that were joined hold several times.
-    unit: of the coordinates, as comments before the rows tell it.
+    unit: of the coordinates, as comments before the rows tell it. seconds: (column, seconds of its unit) where a row below
+    the header tells that a column is in a unit of time.
     """
 
     path: Path
@@ -57,6 +65,7 @@ class TextTable:
     limit: int | None = None
     header: str = ""
     unit: str = ""
+    seconds: tuple[tuple[str, float], ...] = ()
 
     @cached_property
     def numbered(self) -> list[tuple[int, str]]:
@@ -118,8 +127,18 @@ class TextTable:
         return [self._row(line, number)[place] for number, line in self.numbered]
 
     def moments(self, place: int) -> np.ndarray | None:
-        """Returns None: a column of a text has no type that says it holds times."""
-        return None
+        """Returns the seconds f64 (N) since the first of a column of numbers in a unit of time, as a row below the header tells;
+        None of others: a text has no types.
+        """
+        unit = dict(self.seconds).get(self.names[place]) if self.names else None
+        if unit is None:
+            return None
+        try:
+            values = self.columns([place])[:, 0]
+        except DataError:  # such as times of day
+            return None
+        known = values[np.isfinite(values)]
+        return (values - known[0]) * unit if len(known) else None
 
     def _read_fast(self, places: list[int]) -> np.ndarray | None:
         """Returns what NumPy reads where some columns hold words; None where the text is none that it reads right."""
@@ -290,13 +309,28 @@ def _with_units(table: TextTable) -> TextTable:
     axes = named_axes(table.path, table.names) if row else None
     if not row or not axes:
         return table
-    units = dict(enumerate(names_in(row[1].strip(_EDGES), table.delimiter or delimiter_of(row[1]))))
-    told = {unit_of(f"x {units.get(place, '')}") for place in axes[0]}
+    units = names_in(row[1].strip(_EDGES), table.delimiter or delimiter_of(row[1]))
+    told = {unit_of(f"x {units[place] if place < len(units) else ''}") for place in axes[0]}
     if len(told) != 1 or not (unit := told.pop()):
         return table
     names = tuple(f"{name} [{unit}]" if place in axes[0] else name for place, name in enumerate(table.names))
-    number = table.first_line + row[0].count("\n")
-    return replace(table, names=names, body=table.body[row.end() :], first_line=number)
+    return replace(
+        table,
+        names=names,
+        body=table.body[row.end() :],
+        first_line=table.first_line + row[0].count("\n"),
+        seconds=seconds_by_name(names, units),
+    )
+
+
+def seconds_by_name(names: Sequence[str], units: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Returns the columns of which a row of units tells one of time, with the seconds of that.
+
+    >>> seconds_by_name(["frame", "time", "x", "dwell"], ["-", "[ms]", "mm"])
+    (('time', 0.001),)
+    """
+    found = ((name, seconds_in_brackets(" ".join(words_of(unit)))) for name, unit in zip(names, units))
+    return tuple((name, seconds) for name, seconds in found if seconds)
 
 
 def _with_row_names(table: TextTable, rows: list[tuple[int, str]]) -> TextTable:

@@ -13,26 +13,9 @@ from typing import Protocol
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.column_names import words_of
+from dpcli.prepare.cloud_formats.column_names import SECONDS, seconds_in_brackets, words_of
 from dpcli.runtime.clips.name_numbers import is_ticks
 
-_UNITS = (
-    (1.0, "s sec secs second seconds"),
-    (1e-3, "ms msec msecs milli millis millisec millisecs millisecond milliseconds"),
-    (1e-6, "us usec usecs micro micros microsec microsecs microsecond microseconds"),
-    (1e-9, "ns nsec nsecs nano nanos nanosec nanosecs nanosecond nanoseconds"),
-    (60.0, "minute minutes"),
-    (3600.0, "hour hours hr hrs"),
-    (86_400.0, "days"),
-)
-_SECONDS = {word: size for size, words in _UNITS for word in words.split()}
-_IN_BRACKETS = {
-    "min": 60.0,
-    "mins": 60.0,
-    "h": 3600.0,
-    "d": 86_400.0,
-    "day": 86_400.0,
-}  # which mean something else without
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 SHORTEST = 1e-4  # seconds between frames: what is shorter are days, or times of points
 _LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
@@ -97,13 +80,13 @@ def seconds_of(column: str, values: np.ndarray) -> float:
     words = words_of(column)
     if several := _SEVERAL.search(column):
         size, unit = several[1], " ".join(words_of(several[2]))
-        return float(size) * _SECONDS.get(unit, 0.0) if re.fullmatch(r"\d+(\.\d+)?", size) else 0.0
-    if len(words) > 1 and words[-1] in _SECONDS:
-        return _SECONDS[words[-1]]
+        return float(size) * SECONDS.get(unit, 0.0) if re.fullmatch(r"\d+(\.\d+)?", size) else 0.0
+    if len(words) > 1 and words[-1] in SECONDS:
+        return SECONDS[words[-1]]
     if set(words) & _TIME_WORDS and (inside := _BRACKETS.search(column)):
         told = words_of(inside[1])
         if not set(told) <= _NO_UNITS:
-            return _IN_BRACKETS.get(" ".join(told), 0.0)
+            return seconds_in_brackets(" ".join(told))
     digits = {len(str(int(abs(value)))) for value in values[[0, -1]]}
     epoch = _EPOCHS.get(digits.pop(), 0.0) if len(digits) == 1 else 0.0
     epoch = _TICK if epoch and all(is_ticks(int(value)) for value in values[[0, -1]]) else epoch
@@ -197,17 +180,17 @@ def seconds_and_parts(table: Table, name: str) -> Clock | None:
     ``stamp.sec`` and ``stamp.nanosec``; None without it.
     """
     words = words_of(name)
-    if not words or _SECONDS.get(words[-1]) != 1:
+    if not words or SECONDS.get(words[-1]) != 1:
         return None
     for other in table.names:
         *rest, unit = words_of(other) or [""]
-        if rest != words[:-1] or _SECONDS.get(unit, 1) >= 1:
+        if rest != words[:-1] or SECONDS.get(unit, 1) >= 1:
             continue
         try:
             values = table.columns([table.names.index(name), table.names.index(other)])
         except DataError:
             continue
-        seconds, parts = values[:, 0], values[:, 1] * _SECONDS[unit]
+        seconds, parts = values[:, 0], values[:, 1] * SECONDS[unit]
         if len(values) and (seconds == np.floor(seconds)).all() and ((parts >= 0) & (parts < 1)).all():
             return Clock((name, other), seconds - seconds[0] + parts)
     return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +46,7 @@ def convert_clip(
     config: everything that decides the content, digests of the inputs among them. Raises UsageError when `output` was
     made another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
     """
-    provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
+    provenance = record({"reader": source, **config}, seed)
     if not force and already_made(output, provenance, ViewsReader):
         with ViewsReader(output) as reader:
             return reader.header

@@ -152,6 +152,28 @@ def test_into_one_file_with_new_splits(whole, tmp_path):
         split(whole, tmp_path / "new.H5", other)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--fractions", "0.5,0.25,0.25"),
+        ("--fractions", "0.5,0,0.5", "--by-subject", "--seed", "3"),
+        ("--train-subjects", "1,3", "--validation-subjects", "2"),
+        ("--list", "list.csv"),
+        (),
+    ],
+)
+@pytest.mark.parametrize("output", ["d", "new.h5"])
+def test_the_same_command_again_finds_its_work_done(whole, tmp_path, monkeypatch, words, output):
+    monkeypatch.chdir(tmp_path)
+    Path("list.csv").write_text(
+        "name,split\n" + "".join(f"s{k:02},{'train' if k % 2 else 'test'}\n" for k in range(12))
+    )
+    command = ("prepare", "split", whole.name, "-o", output, *words)
+    first, again = dpc(*command), dpc(*command)
+    assert first.returncode == again.returncode == 0 and first.stdout == again.stdout
+    assert "already complete" in again.stderr and "already complete" not in first.stderr
+
+
 def test_subjects_stay_together(whole, tmp_path):
     split(whole, tmp_path / "new.H5", SplitChoice(fractions=(0.5, 0.25, 0.25), by_subject=True))
     with CloudsReader(tmp_path / "new.H5") as reader:

@@ -231,3 +231,6 @@ def test_the_closing_line_is_what_a_person_can_check(tmp_path):
     assert one == two and "2 sequences of 1 to 2 frames without times, 6 points at (0,0,0) dropped" in one[0]
     with CloudsReader(tmp_path / "b.h5") as reader:
         assert closing_lines(reader, {})[0] in one[0]
+        dropped = {"frames without points dropped": 1, "points at (0,0,0) dropped": 2}
+        told = closing_lines(reader, dropped)[0]
+        assert told.endswith(", 1 frame without points dropped, 2 points at (0,0,0) dropped")

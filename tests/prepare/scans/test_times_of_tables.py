@@ -28,6 +28,29 @@ def csv(path, header, rows):
 
 
 @pytest.mark.parametrize(
+    ("name", "unit", "values", "expected"),
+    [
+        ("time", "ms", [0, 33.3, 66.7], [0, 0.0333, 0.0667]),  # with fractions they would be taken for seconds
+        ("t", "[s]", [7, 8, 10], [0, 1, 3]),
+        ("stamp", "µs", [5, 40_005, 90_005], [0, 0.04, 0.09]),
+        ("clock time", "min", [1, 2, 4], [0, 60, 180]),
+        ("time", "-", [3, 4, 5], None),
+        ("time", "s", ["23:59:59", "00:00:00", "00:00:01"], [0, 1, 2]),
+        ("dwell", "ms", [0, 40, 90], None),
+    ],
+)
+def test_a_row_of_units_tells_that_of_times_beside_frames_and_of_frames(tmp_path, name, unit, values, expected):
+    rows = [(frame, value, 10, 20, k) for frame, value in zip((7, 8, 9), values) for k in (1, 2)]
+    path = csv(tmp_path / "a.csv", f"frame,{name},x,y,z", [("-", unit, "mm", "mm", "mm"), *rows])
+    sequence, _ = only_sequence(path, frame_column="frame", keep=(name,) if expected and unit != "s" else ())
+    np.testing.assert_allclose(sequence.points[:2], [[0.01, 0.02, 0.001], [0.01, 0.02, 0.002]])
+    assert (sequence.time is None) == (expected is None)
+    if expected:
+        np.testing.assert_allclose(sequence.time, expected, atol=1e-9)
+        np.testing.assert_allclose(only_sequence(path, frame_column=name)[0].time, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
     ("name", "values", "expected"),
     [
         ("t [µs]", [0.0, 50_000.5], [0, 0.0500005]),

@@ -191,3 +191,16 @@ def test_the_place_of_a_rigid_body_stands_behind_its_quaternion(tmp_path: Path) 
         (item,) = (reader := TableSequences(tmp_path / name, track="columns")).items()
         found = reader.read(item, np.random.default_rng(0)).sequence.points.reshape(points.shape)
         np.testing.assert_allclose(found, points, atol=1e-5)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("(s)", 1.0), ("", 1.0)])
+def test_a_row_of_units_tells_that_of_the_times(tmp_path, unit, seconds):
+    points, written = _moving(), [0.0, 33.3, 66.7, 100.1, 133.4, 166.7, 200.2]
+    rows = _rows(1000 * points, ",", lambda t: [t, written[t]])
+    names = ",".join(f"{name}_{axis}" for name in _NAMES for axis in "xyz")
+    (tmp_path / "w.csv").write_text("\n".join([f"Frame,Time,{names}", f",{unit}" + ",mm" * 3 * _MARKERS, *rows]) + "\n")
+    reader = TableSequences(tmp_path / "w.csv", track="columns")
+    (item,) = reader.items()
+    sequence = reader.read(item, np.random.default_rng(0)).sequence
+    np.testing.assert_allclose(sequence.time, np.array(written) * seconds)
+    np.testing.assert_allclose(sequence.points.reshape(points.shape), points, atol=1e-6)
