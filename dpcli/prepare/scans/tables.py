@@ -48,6 +48,7 @@ PIECES = (
     " pandas.read_parquet(FOLDER).to_parquet(FILE)"
 )
 _FEW = 5  # frames of one point that may be true
+_OTHER_RATE = 0.05  # of a rate that was given, from which the times of a column differ by as much
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,12 @@ class TableSequences(OwnScans):
                 lines[0] += f", times by column {' and '.join(map(repr, clock))}"
             lines[0] += f"; not read: {unused}" if unused else ""
             lines[0] += " (--keep-fields)" if unused and self.track != COLUMNS else ""
+            told = first.times(loaded.column, None) if self.fps else None
+            rate = 1 / float(np.median(np.diff(told))) if told is not None and len(told) > 1 else self.fps
+            if self.fps and abs(rate / self.fps - 1) > _OTHER_RATE:
+                lines.append(
+                    f"--fps {self.fps:g} is not used: column {loaded.column!r} tells the times, {rate:.3g} frames a second"
+                )
         pieces = [name for name in self._paths if _PIECE.fullmatch(name)]
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
         lines += left_out_below(self.raw, TABLES)

@@ -131,6 +131,16 @@ def test_moments_written_as_days_or_as_digits_are_seconds(tmp_path, rate, writte
     np.testing.assert_allclose(sequence.time, np.arange(len(values)) / rate, atol=2e-5)
 
 
+@pytest.mark.parametrize(("fps", "told"), [(10, True), (25, False)])
+def test_a_rate_that_the_times_of_the_frame_column_overrule_is_told(tmp_path, fps, told):
+    path = csv(tmp_path / "a.csv", "t_ms,x,y,z", [(40 * frame, 1, 2, 3) for frame in range(5) for _ in (1, 2)])
+    reader = TableSequences(path, frame_column="t_ms", fps=fps)
+    (item,) = reader.items()
+    np.testing.assert_allclose(reader.read(item, RNG).sequence.time, np.arange(5) / 25)
+    lines = [line for line in reader.summary([item]) if "not used" in line]
+    assert lines == (["--fps 10 is not used: column 't_ms' tells the times, 25 frames a second"] if told else [])
+
+
 def test_plain_seconds_stay_seconds(tmp_path):
     for start in (0, 50, 45_000, 735_000, 143_050):
         times = start + np.arange(500) * 0.25
