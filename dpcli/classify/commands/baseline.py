@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.classify.data.columns import not_read, telling_columns
+from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.descriptors import descriptors
 from dpcli.classify.data.validation_split import about_other_splits
 from dpcli.counted import counted
@@ -71,6 +72,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         _tell_left_out(reader, known)
+        tell_copies(reader, [(known[learned].tolist(), known[judged].tolist()) for learned, judged in rounds])
         for learned, judged in rounds:
             scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)
         judged = np.flatnonzero(np.isfinite(scores[:, 0]))

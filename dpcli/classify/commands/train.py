@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
+from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
 from dpcli.classify.data.likeness import file_like, tell_mixed_rates, tell_rounded, tell_unlike
 from dpcli.classify.data.slots import measured, preset_for
@@ -199,12 +201,21 @@ def _forest(videos: _Videos, seed: int) -> float | None:
     source, held = videos.training, videos.validation
     if held is None or not _FOREST[0] <= len(source.sequences) <= _FOREST[1]:
         return None
-    groups = [(list(source.sequences), list(held.sequences))]
-    if source.folds:
-        of = source.folds
-        groups = [([i for i in of if of[i] != k], [i for i in of if of[i] == k]) for k in sorted(set(of.values()))]
+    groups = _judgments(source.sequences, held.sequences, source.folds)
     right = [len(judged) * forest_accuracy(source.reader, learned, judged, seed) for learned, judged in groups]
     return sum(right) / sum(len(judged) for _, judged in groups)
+
+
+def _judgments(
+    training: Sequence[int], validation: Sequence[int], of: Mapping[int, int]
+) -> list[tuple[list[int], list[int]]]:
+    """Returns the sequences that are learned from, and those that what learned is judged on: fold by fold where there are some.
+
+    of: the fold of each sequence, {} without folds.
+    """
+    if not of:
+        return [(list(training), list(validation))]
+    return [([i for i in of if of[i] != k], [i for i in of if of[i] == k]) for k in sorted(set(of.values()))]
 
 
 def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:
@@ -259,6 +270,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
     if rule == CROSS:
         options["folds"] = cross_folds(reader, training, settings.network.members, seed)
+    tell_copies(reader, [*_judgments(training, validation, options.get("folds", {})), (training, _tests(reader))])
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
@@ -271,6 +283,11 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     digest = provenance.file_digest(path)
     lasting = lasting_rule(reader, rule, validation)
     return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out, lasting)
+
+
+def _tests(reader: CloudsReader) -> list[int]:
+    """Returns the labeled videos that the file keeps for tests."""
+    return [i for i, split in enumerate(reader.splits) if split == "test" and reader.labels[i] >= 0]
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:

@@ -27,7 +27,8 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
     middle = np.median(sequence.points, 0)
     columns = [sequence.extra.get(name, np.zeros(len(times))) for name in fields]
     values = np.column_stack([sequence.points - middle, *columns]).astype(np.float64)
-    size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
+    place = middle if sequence.shift is None else middle + sequence.shift  # of other videos nothing may be taken off
+    size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *place]
     found = np.concatenate([size, described(values, times * SLOTS // max(sequence.num_frames, 1))])
     return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dpcli.classify.data.clips import Clip, ClipSource, clip_frames, uniform_frames
+from dpcli.classify.data.likeness import NOTE
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.video_scores import clip_scores
@@ -82,12 +83,21 @@ def window_size(info: ModelInfo, window: int | None) -> int:
     if window is None:
         raise UsageError(
             f"this model looks at whole videos in {counted(needed, 'part')}, and a stream has no end: give the number of frames"
-            " to look back, about as many as an action lasts, such as --window 40"
+            f" to look back, about as many as an action lasts, such as --window 40{_longest(info)}"
         )
     least = 1 if info.timing == "slots" else needed
     if window < least:
         raise UsageError(f"--window {window}: the model takes {counted(needed, 'frame')}; expected at least {least}")
     return window
+
+
+def _longest(info: ModelInfo) -> str:
+    """Returns how long the videos were that a model learned from, as the end of a sentence, "" where it doesn't say."""
+    own = info.notes.get(NOTE)
+    longest = own.get("frames") if isinstance(own, dict) else None
+    if not isinstance(longest, int | float):
+        return ""
+    return f" (the longest video that it learned from had {counted(int(longest), 'frame')})"
 
 
 class StreamPredictor:

@@ -162,3 +162,13 @@ def test_the_command_reads_stdin_and_prints_one_line(tmp_path, monkeypatch, caps
     assert exit_code("classify", "baseline", data, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] == 6 and found["accuracy"] == found["right"] / 6
+
+
+def test_a_video_stands_where_it_was_seen_whatever_was_taken_off_its_coordinates():
+    """`prepare clouds` takes a corner off far clouds, and only of those: in millimeters of some videos of a file."""
+    rng = np.random.default_rng(0)
+    frames = [rng.normal(0, 1, (4, 3)).astype(np.float32) for _ in range(6)]
+    moved = CloudSequence.from_frames("v", [frame - np.float32(300) for frame in frames])
+    moved.shift = np.full(3, 300.0)
+    own, other = (descriptor(one, ()) for one in (CloudSequence.from_frames("v", frames), moved))
+    assert np.allclose(own, other, atol=1e-3)

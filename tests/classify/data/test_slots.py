@@ -20,6 +20,7 @@ from dpcli.classify.data.validation_split import (
 from dpcli.classify.network import sync_norm
 from dpcli.classify.network.backbones.point_slots import slot_quantiles
 from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.layers import RowNorm
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.settings import network_config
 from dpcli.classify.stream.sliding_window import StreamPredictor
@@ -201,6 +202,23 @@ def test_copies_are_mirrored_or_reversed_and_have_classifiers_of_their_own(tmp_p
     member.eval()
     each = [torch.softmax(member(member._copied(clip, one), one), -1) for one in kinds[:, None]]
     assert torch.allclose(member.scores(clip, NO_FOREST), torch.stack(each).mean(0), atol=1e-6)
+
+
+@pytest.mark.parametrize("part", ["all", "head", "probe"])
+def test_whatever_learns_of_a_member_it_learns_one_copy_of_each_clip(tmp_path, part):
+    """All four would cost four times as much, and be learned together, while each has a classifier of its own."""
+    config = config_of(tmp_path, [video()]).changed(copies=True)
+    clip = torch.from_numpy(in_slots(slot_rows(video(), config), config, np.random.default_rng(0)))[None]
+    model, seen = Kinet(config), []
+    branch = model.static
+    freeze(branch, part)
+    train_mode(branch, part)
+    for member in branch.members:
+        member.register_forward_hook(lambda _, given, __: seen.append(len(given[0])))
+    model.static_logits(clip).sum().backward()
+    assert sum(seen) == 1
+    norms = [module.training for module in branch.modules() if isinstance(module, RowNorm)]
+    assert norms and set(norms) == {part == "all"}
 
 
 def test_details_tell_when_something_happens_and_are_not_moved_by_a_point_far_off(tmp_path):

@@ -31,7 +31,7 @@ from dpcli.classify.network.model_file import ModelInfo, save_model
 from dpcli.classify.stream import frame_source as stream_input
 from dpcli.classify.stream.frame_source import open_frames, read_arrays
 from dpcli.classify.stream.read_ahead import ReadAhead
-from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window
+from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window, window_size
 from dpcli.classify.video_scores import batches, predict_videos
 from dpcli.cli.app import main
 from dpcli.cli.classify import predict as command
@@ -482,6 +482,14 @@ def test_wrong_use_is_told(message, model_file, uniform_file, tmp_path):
         predict(str(tmp_path / "x.npy"), str(model), **options)
     with pytest.raises(DataError, match="no such file"):
         predict(str(tmp_path / "absent"), str(model_file), stream=True)
+
+
+def test_a_missing_window_is_told_with_how_long_the_videos_of_the_training_were():
+    info = ModelInfo(CONFIG, ["a", "b"], "uniform", {"learned_from": {"frames": 17.0}})
+    with pytest.raises(UsageError, match=r"--window 40 \(the longest video that it learned from had 17 frames\)$"):
+        window_size(info, None)
+    with pytest.raises(UsageError, match="--window 40$"):
+        window_size(ModelInfo(CONFIG, ["a", "b"], "uniform"), None)
 
 
 def start(model_file: Path, *words: object) -> subprocess.Popen:

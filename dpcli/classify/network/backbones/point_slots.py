@@ -62,7 +62,8 @@ class PointSlots(Backbone):
         for member, asked in zip(self.members, voting.T):
             if asked.any() or (self.training and has_synchronized_norms(member)):
                 which = asked.nonzero()[:, 0]
-                total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
+                scores = member.scores(clips[which], self.forest_share, self.training)
+                total = total.index_add(0, which, scores.to(total))
         logits = torch.log(total.clamp(min=_LEAST) / voting.sum(1, keepdim=True))
         empty = (clips[..., 3] == 0).flatten(1).all(1, keepdim=True)
         return torch.where(empty & (not self.training), torch.zeros_like(logits), logits)
@@ -115,10 +116,13 @@ class _Member(nn.Module):
         self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
-    def scores(self, clips: Tensor, share: Tensor) -> Tensor:
+    def scores(self, clips: Tensor, share: Tensor, training: bool = False) -> Tensor:
         """Returns the probabilities (B,C): in training of one copy of each clip, drawn at random; else the mean over all copies,
-        and the geometric mean of it and, with its share, the forest's."""
-        if self.training:
+        and the geometric mean of it and, with its share, the forest's.
+
+        training: whether the network learns; where that is a last layer alone, the member itself is in evaluation mode.
+        """
+        if training:
             kinds = torch.randint(self.copies, (len(clips),)).to(clips.device)
             return torch.softmax(self(self._copied(clips, kinds), kinds), -1)
         total = clips.new_zeros(len(clips), self.forest.classes)
