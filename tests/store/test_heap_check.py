@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.prepare.scans.modelnet40 import read_file
+from dpcli.prepare.scans.modelnet40 import read_labels
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.heap_check import check_heaps, trust_heaps
 
@@ -119,7 +119,7 @@ def test_other_files_of_hdf5_are_looked_at_too(tmp_path):
         with pytest.raises(DataError, match="its heap of texts"):
             check_heaps(path)
     with pytest.raises(DataError, match="its heap of texts"):
-        read_file(tmp_path / "ply_data_train0.h5", "data")
+        read_labels(tmp_path / "ply_data_train0.h5")
 
 
 def test_the_letters_of_a_heap_in_data_are_data(tmp_path):

@@ -148,8 +148,6 @@ number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.Scor
 scored = []
 def ending(work, numbered):
     scored.append(numbered[0])
-    if len(scored) == after + 1 and not number:
-        raise MemoryError
     if len(scored) == after + 1:
         os.kill(os.getpid(), number)
     return whole(work, numbered)
@@ -166,14 +164,33 @@ def whole_scores(data, run_folder) -> Path:
     return path
 
 
+def ending_early(number: int, after: int, dpc_here, words: list) -> subprocess.CompletedProcess:
+    """A prediction that sends itself a signal once so many videos are scored, or lacks memory where that is 0."""
+    if number == signal.SIGKILL:
+        command = [sys.executable, "-c", ENDS_EARLY, int(number), after, *words]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.run([str(word) for word in command], capture_output=True, env=environment)
+    score, scored = predict.ScoreVideo.__call__, []
+
+    def ending(work, numbered):
+        scored.append(numbered[0])
+        if len(scored) == after + 1 and not number:
+            raise MemoryError
+        if len(scored) == after + 1:
+            os.kill(os.getpid(), number)
+        return score(work, numbered)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(predict.ScoreVideo, "__call__", ending)
+        return dpc_here(*words)
+
+
 @pytest.mark.parametrize(("number", "kept"), [(signal.SIGTERM, 4), (signal.SIGKILL, 3), (0, 3)])  # 0: too little memory
 def test_a_stopped_and_a_killed_prediction_go_on(
     data, run_folder, whole_scores, dpc_here, tmp_path, monkeypatch, number, kept
 ):
     words = ["classify", "predict", data, "--model", run_folder, "--split", "all", "-o", tmp_path / "s.h5"]
-    command = [sys.executable, "-c", ENDS_EARLY, int(number), 3, *words]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    first = subprocess.run([str(word) for word in command], capture_output=True, env=environment)
+    first = ending_early(number, 3, dpc_here, words)
     assert first.returncode == {signal.SIGTERM: 75, signal.SIGKILL: -9}.get(number, 1), first.stderr.decode()
     assert not (tmp_path / "s.h5").exists()
     if number == signal.SIGTERM:
@@ -194,8 +211,7 @@ def test_a_stopped_and_a_killed_prediction_go_on(
 
 def test_another_prediction_leaves_what_is_kept(data, run_folder, dpc_here, tmp_path):
     words = ["classify", "predict", str(data), "--model", str(run_folder), "-o", str(tmp_path / "s.h5")]
-    command = [sys.executable, "-c", ENDS_EARLY, str(int(signal.SIGTERM)), "1", *words, "--split", "all"]
-    assert subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 75
+    assert ending_early(signal.SIGTERM, 1, dpc_here, [*words, "--split", "all"]).returncode == 75
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = dpc_here(*words, "--split", "test")
     assert other.returncode == 2 and b'config.split "all", now "test"' in other.stderr and b"--force" in other.stderr
