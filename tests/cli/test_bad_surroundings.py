@@ -117,7 +117,7 @@ def test_a_disk_without_one_free_byte_is_told_in_the_same_words(words, tmp_path,
     assert re.fullmatch(told, done.stderr), done.stderr
 
 
-def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc, mounting):
+def test_a_full_disk_below_the_pipe(raw, tmp_path, mounting):
     """`-o -` spools beside nothing the user named: the message still says what was full."""
     script = (
         'mount -t tmpfs -o size=2m none "$TMPDIR"; set +e\n'

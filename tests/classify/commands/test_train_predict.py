@@ -1,4 +1,4 @@
-"""`dpc classify` as people use it: real processes, pipes, signals, kills, wrong input."""
+"""`dpc classify` as people use it: pipes, signals, kills, wrong input."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
-from tests.support.commands import exit_code
+from tests.support.commands import exit_code, piped
 
 ROOT = Path(__file__).resolve().parents[3]
 TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "0.34")
@@ -50,10 +50,10 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run_folder(data, dpc) -> Path:
+def run_folder(data) -> Path:
     folder = data.parent / "run"
-    done = dpc("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2")
-    assert done.returncode == 0, done.stderr.decode()
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2")
+    assert exit_code(*words) == 0
     return folder
 
 
@@ -80,17 +80,17 @@ def test_training_fits_a_confidence_that_streams_and_segments_take(data, run_fol
     assert done.returncode == 0 and done.stdout.startswith(b"recording,start,end,class,confidence")
 
 
-def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc, tmp_path):
-    by_file = dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
+def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc_here, tmp_path):
+    by_file = dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
     assert by_file.returncode == 0, by_file.stderr.decode()
-    piped = dpc("classify", "predict", "-", "--model", run_folder, "-o", "-", stdin=data.read_bytes())
-    assert piped.returncode == 0 and piped.stdout[1:4] == b"HDF"
-    (tmp_path / "p.h5").write_bytes(piped.stdout)
+    through = piped("classify", "predict", "-", "--model", run_folder, "-o", "-", stdin=data.read_bytes())
+    assert through.returncode == 0 and through.stdout[1:4] == b"HDF"
+    (tmp_path / "p.h5").write_bytes(through.stdout)
     a, b = ScoresReader(tmp_path / "s.h5"), ScoresReader(tmp_path / "p.h5")
     assert np.array_equal(a.scores, b.scores) and a.names == b.names == [f"v{i}" for i in range(12) if i % 3 == 2]
     np.testing.assert_allclose(a.scores, (a.streams["static"] + a.streams["dynamic"]) / 2, atol=1e-6)
     np.testing.assert_allclose(a.scores.sum(1), 1, atol=1e-5)
-    report = dpc("evaluate", "classification", "-", "--json", stdin=piped.stdout)
+    report = piped("evaluate", "classification", "-", "--json", stdin=through.stdout)
     assert report.returncode == 0, report.stderr.decode()
     answer = json.loads(report.stdout)
     assert answer["units"]["accuracy"] == "fraction"
