@@ -62,12 +62,19 @@ def folder(tmp_path_factory) -> Path:
     return root
 
 
+ONE_AFTER_THE_OTHER = """
+import sys
+from tests.support.commands import exit_code
+for line in sys.argv[1:]:
+    print("code", exit_code(*line.split()), flush=True)
+"""
+
+
 def in_read_only(folder: Path, lines: list[str]) -> str:
     """Runs commands where `ro` is a read-only file system; returns what they say, each with its exit code."""
-    commands = "\n".join(f'"{sys.executable}" -m dpcli {line} 2>&1; echo "code $?"' for line in lines)
-    script = f'set -e; mount --bind "$D/ro" "$D/ro"; mount -o remount,ro,bind "$D/ro"; cd "$D"; set +e\n{commands}'
+    script = 'mount --bind "$D/ro" "$D/ro"; mount -o remount,ro,bind "$D/ro"; cd "$D"; exec "$@" 2>&1'
     done = subprocess.run(
-        ["unshare", "-rm", "sh", "-c", script],
+        ["unshare", "-rm", "sh", "-ec", script, "sh", sys.executable, "-c", ONE_AFTER_THE_OTHER, *lines],
         capture_output=True,
         text=True,
         timeout=300,

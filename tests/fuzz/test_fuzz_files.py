@@ -117,10 +117,7 @@ def test_damages_are_the_same_each_time(tmp_path):
     assert made[0] == made[1] != b"frame,x,y\n0,1.5,2\n1,2.5,3\n"
 
 
-ONLY = (
-    "info in/(g|parts|views|scene)|prepare (?!anim|artemis)|segment joints in/parts.h5 -o out/j|generate4d export"
-    "|evaluate segm"
-)
+ONLY = "info in/(g|views)|prepare (?!anim|artemis)"  # no networks, whose seeds took longer than all inputs
 
 
 def test_a_slice_of_it_finds_nothing(tmp_path):

@@ -331,7 +331,7 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     import imageio.v3 as imageio
 
     views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
-    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", *steps(20, 20))
+    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", *steps(3, 3))
     done = dpc_here(*words, "--picture", tmp_path / "first.png")
     assert done.returncode == 0 and done.stderr.count(b"preview.png: a preview from all sides") == 1
     before = scene.read_bytes()

@@ -45,7 +45,7 @@ def cut(reader: ToyReader, folder: Path, count: int, **options) -> list[Path]:
     return paths
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=9, deadline=None)
 @given(count=st.integers(1, 9), bad=st.sets(st.integers(0, 6), max_size=6), data=st.data())
 def test_any_cut_gives_the_same_bytes(tmp_path_factory, count, bad, data):
     """Also with bad samples, with shards that have none at all, and with the files in any order."""

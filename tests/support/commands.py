@@ -32,3 +32,12 @@ def told(*words: object) -> subprocess.CompletedProcess[str]:
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = typed(*words)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def piped(*words: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+    """As `typed`, in the middle of a pipe: it reads these bytes, and the result holds the bytes of its stdout and stderr."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), write_through=True) for _ in range(2))
+    reading = mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+    with reading, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = typed(*words)
+    return subprocess.CompletedProcess(words, code, out.buffer.getvalue(), err.buffer.getvalue())

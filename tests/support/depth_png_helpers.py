@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 
-def png_bytes(image: np.ndarray, color: int = 0) -> bytes:
-    """A gray PNG of u8 or u16 (H,W), after the PNG specification: no filter, one IDAT, big-endian samples."""
+def png_bytes(image: np.ndarray) -> bytes:
+    """A PNG of u8 or u16, gray (H,W) or RGB (H,W,3), after the specification: no filter, one IDAT, big-endian samples."""
     height, width = image.shape[:2]
     rows = image.astype(image.dtype.newbyteorder(">")).reshape(height, -1)
     raw = b"".join(b"\0" + row.tobytes() for row in rows)
-    header = struct.pack(">IIBBBBB", width, height, 8 * image.dtype.itemsize, color, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8 * image.dtype.itemsize, 2 * (image.ndim == 3), 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(raw, 1)), (b"IEND", b"")]
     body = b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
     return b"\x89PNG\r\n\x1a\n" + body

@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 
+from tests.support.depth_png_helpers import png_bytes
+
 P2 = np.array([[7.2e2, 0, 6.1e2, 4.5e1], [0, 7.2e2, 1.7e2, 2.2e-1], [0, 0, 1, 2.7e-3]])
-
-
-def png_bytes(image: np.ndarray) -> bytes:
-    """(H,W) or (H,W,3) u8 or u16 -> a PNG, written chunk by chunk, channels in their own order (RGB)."""
-    height, width = image.shape[:2]
-    bits, color = image.dtype.itemsize * 8, 2 if image.ndim == 3 else 0
-    big = image.astype(image.dtype.newbyteorder(">")).reshape(height, -1)
-    rows = b"".join(b"\0" + row.tobytes() for row in big)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""`dpc classify` as people use it: real processes, pipes, signals, kills, wrong input."""
+"""`dpc classify` as people use it: pipes, signals, kills, wrong input."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
-from tests.support.commands import exit_code
+from tests.support.commands import exit_code, piped
 
 ROOT = Path(__file__).resolve().parents[3]
 TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "0.34")
@@ -50,10 +50,10 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run_folder(data, dpc) -> Path:
+def run_folder(data) -> Path:
     folder = data.parent / "run"
-    done = dpc("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2")
-    assert done.returncode == 0, done.stderr.decode()
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2")
+    assert exit_code(*words) == 0
     return folder
 
 
@@ -80,17 +80,17 @@ def test_training_fits_a_confidence_that_streams_and_segments_take(data, run_fol
     assert done.returncode == 0 and done.stdout.startswith(b"recording,start,end,class,confidence")
 
 
-def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc, tmp_path):
-    by_file = dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
+def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc_here, tmp_path):
+    by_file = dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
     assert by_file.returncode == 0, by_file.stderr.decode()
-    piped = dpc("classify", "predict", "-", "--model", run_folder, "-o", "-", stdin=data.read_bytes())
-    assert piped.returncode == 0 and piped.stdout[1:4] == b"HDF"
-    (tmp_path / "p.h5").write_bytes(piped.stdout)
+    through = piped("classify", "predict", "-", "--model", run_folder, "-o", "-", stdin=data.read_bytes())
+    assert through.returncode == 0 and through.stdout[1:4] == b"HDF"
+    (tmp_path / "p.h5").write_bytes(through.stdout)
     a, b = ScoresReader(tmp_path / "s.h5"), ScoresReader(tmp_path / "p.h5")
     assert np.array_equal(a.scores, b.scores) and a.names == b.names == [f"v{i}" for i in range(12) if i % 3 == 2]
     np.testing.assert_allclose(a.scores, (a.streams["static"] + a.streams["dynamic"]) / 2, atol=1e-6)
     np.testing.assert_allclose(a.scores.sum(1), 1, atol=1e-5)
-    report = dpc("evaluate", "classification", "-", "--json", stdin=piped.stdout)
+    report = piped("evaluate", "classification", "-", "--json", stdin=through.stdout)
     assert report.returncode == 0, report.stderr.decode()
     answer = json.loads(report.stdout)
     assert answer["units"]["accuracy"] == "fraction"
@@ -148,8 +148,6 @@ number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.Scor
 scored = []
 def ending(work, numbered):
     scored.append(numbered[0])
-    if len(scored) == after + 1 and not number:
-        raise MemoryError
     if len(scored) == after + 1:
         os.kill(os.getpid(), number)
     return whole(work, numbered)
@@ -166,14 +164,33 @@ def whole_scores(data, run_folder) -> Path:
     return path
 
 
+def ending_early(number: int, after: int, dpc_here, words: list) -> subprocess.CompletedProcess:
+    """A prediction that sends itself a signal once so many videos are scored, or lacks memory where that is 0."""
+    if number == signal.SIGKILL:
+        command = [sys.executable, "-c", ENDS_EARLY, int(number), after, *words]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.run([str(word) for word in command], capture_output=True, env=environment)
+    score, scored = predict.ScoreVideo.__call__, []
+
+    def ending(work, numbered):
+        scored.append(numbered[0])
+        if len(scored) == after + 1 and not number:
+            raise MemoryError
+        if len(scored) == after + 1:
+            os.kill(os.getpid(), number)
+        return score(work, numbered)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(predict.ScoreVideo, "__call__", ending)
+        return dpc_here(*words)
+
+
 @pytest.mark.parametrize(("number", "kept"), [(signal.SIGTERM, 4), (signal.SIGKILL, 3), (0, 3)])  # 0: too little memory
 def test_a_stopped_and_a_killed_prediction_go_on(
     data, run_folder, whole_scores, dpc_here, tmp_path, monkeypatch, number, kept
 ):
     words = ["classify", "predict", data, "--model", run_folder, "--split", "all", "-o", tmp_path / "s.h5"]
-    command = [sys.executable, "-c", ENDS_EARLY, int(number), 3, *words]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    first = subprocess.run([str(word) for word in command], capture_output=True, env=environment)
+    first = ending_early(number, 3, dpc_here, words)
     assert first.returncode == {signal.SIGTERM: 75, signal.SIGKILL: -9}.get(number, 1), first.stderr.decode()
     assert not (tmp_path / "s.h5").exists()
     if number == signal.SIGTERM:
@@ -194,8 +211,7 @@ def test_a_stopped_and_a_killed_prediction_go_on(
 
 def test_another_prediction_leaves_what_is_kept(data, run_folder, dpc_here, tmp_path):
     words = ["classify", "predict", str(data), "--model", str(run_folder), "-o", str(tmp_path / "s.h5")]
-    command = [sys.executable, "-c", ENDS_EARLY, str(int(signal.SIGTERM)), "1", *words, "--split", "all"]
-    assert subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 75
+    assert ending_early(signal.SIGTERM, 1, dpc_here, [*words, "--split", "all"]).returncode == 75
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = dpc_here(*words, "--split", "test")
     assert other.returncode == 2 and b'config.split "all", now "test"' in other.stderr and b"--force" in other.stderr

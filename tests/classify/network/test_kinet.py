@@ -8,6 +8,7 @@ import json
 import pytest
 import torch
 
+from dpcli.classify import network_speed
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinematic import KinematicUnit
 from dpcli.classify.network.kinet import Kinet, fuse
@@ -318,7 +319,8 @@ def test_the_global_head_in_training_is_batch_norm_written_out():
         torch.testing.assert_close(mine.running_var.double(), other.running_var, rtol=1e-5, atol=1e-6)
 
 
-def test_profile_splits_steps_into_their_parts():
+def test_profile_splits_steps_into_their_parts(monkeypatch):
+    monkeypatch.setattr(network_speed, "_STEPS", 1)  # more make the times more exact
     result = measure(Kinet(KinetConfig(**TINY)).eval(), torch.device("cpu"), with_steps=True)
     for name in ("static_step", "dynamic_step", "inference"):
         step = result[name]

@@ -17,6 +17,7 @@ from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, wri
 from dpcli.ops.open3d_import import load_open3d
 from dpcli.store import CloudsReader, PartsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
+from tests.support.commands import piped
 from tests.support.scenes import HINGE, SWING, toy_scene
 
 
@@ -269,8 +270,8 @@ def test_single_files_and_an_instant(scene_file, tmp_path):
         export_scene(str(scene_file), str(tmp_path / "c.json"), time=None, **usual)
 
 
-def test_an_export_flows_into_the_segmenter(dpc, dpc_here, scene_file, tmp_path):
-    clouds = dpc("generate4d", "export", scene_file, "--as", "clouds", "--points", "200", "-o", "-")
+def test_an_export_flows_into_the_segmenter(dpc_here, scene_file, tmp_path):
+    clouds = piped("generate4d", "export", scene_file, "--as", "clouds", "--points", "200", "-o", "-")
     assert clouds.returncode == 0, clouds.stderr.decode()
     (tmp_path / "clouds.h5").write_bytes(clouds.stdout)
     parts, words = tmp_path / "parts.h5", "--method ward --parts 2 --flow nearest --set icp=0".split()

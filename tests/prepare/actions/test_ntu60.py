@@ -218,7 +218,7 @@ def bad_frame(kind: str) -> bytes:
         "flipped": bytes(flipped),
         "size": png_bytes(np.ones((240, 320), np.uint16)),
         "8 bits": png_bytes(np.ones((424, 512), np.uint8)),
-        "color": png_bytes(np.ones((424, 512, 3), np.uint16), 2),
+        "color": png_bytes(np.ones((424, 512, 3), np.uint16)),
         "nothing": png_bytes(np.zeros((424, 512), np.uint16)),
     }[kind]
 

@@ -217,7 +217,7 @@ def test_regions_beyond_the_frames_are_counted(tmp_path, frames):
         (b"", "1_depth.png: the file is empty"),
         (png_bytes(np.ones((240, 320), np.uint16)), "1_depth.png: 320x240 pixels; expected 640x480"),
         (png_bytes(hand_depth(0)[0])[:900], "1_depth.png: a truncated PNG"),
-        (png_bytes(np.ones((480, 640, 3), np.uint8), 2), "8-bit RGB PNG; expected 8 or 16-bit gray depth"),
+        (png_bytes(np.ones((480, 640, 3), np.uint8)), "8-bit RGB PNG; expected 8 or 16-bit gray depth"),
     ],
 )
 def test_bad_frames(tmp_path, content, message):

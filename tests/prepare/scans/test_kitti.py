@@ -23,7 +23,8 @@ from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence, CloudsReader
 from tests.support.commands import told as dpc
-from tests.support.kitti_helpers import P2, png_bytes, velodyne_to_camera, write_calibration, write_png, write_scan
+from tests.support.depth_png_helpers import png_bytes
+from tests.support.kitti_helpers import P2, velodyne_to_camera, write_calibration, write_png, write_scan
 
 H, W = 12, 16
 

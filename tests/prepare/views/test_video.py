@@ -26,7 +26,7 @@ from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
 from dpcli.prepare.views.views_check import ClipIndex
 from dpcli.runtime.clips.video_frames import frame_times, lasts
 from dpcli.store import ViewsReader
-from tests.support.commands import exit_code
+from tests.support.commands import exit_code, piped
 
 RED = (200, 40, 30)
 
@@ -885,7 +885,7 @@ def test_cameras_that_do_not_tell_how_far_the_object_is(tmp_path, cameras, messa
 # ---- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, dpc_here, dpc):
+def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, dpc_here):
     folder = save(tmp_path / "clip", moving(3))
     out = tmp_path / "clip.h5"
     assert dpc_here("prepare", "video", folder, "--size", 32, "-o", out).returncode == 0
@@ -899,8 +899,8 @@ def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, 
     assert other.returncode == 2 and b"size 32, now 48" in other.stderr
     save(folder, moving(4))
     assert dpc_here("prepare", "video", folder, "--size", 32, "-o", out).returncode == 2  # another input
-    piped = dpc("prepare", "video", folder, "--size", 32, "-o", "-")
-    assert piped.returncode == 0 and piped.stdout.startswith(b"\x89HDF")
+    through = piped("prepare", "video", folder, "--size", 32, "-o", "-")
+    assert through.returncode == 0 and through.stdout.startswith(b"\x89HDF")
     bad = dpc_here("prepare", "video", tmp_path, "-o", tmp_path / "b.h5")
     assert bad.returncode == 3 and b"no frames" in bad.stderr and not (tmp_path / "b.h5").exists()
 

@@ -16,7 +16,7 @@ from dpcli.segment.commands.joints import find_joints
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
-from tests.support.commands import exit_code
+from tests.support.commands import exit_code, piped
 from tests.support.drawers import drawer, predicted
 
 
@@ -130,10 +130,10 @@ def test_the_urdf_is_posed_as_the_points_are(parts, tmp_path, dpc_here):
         assert np.median(far) < 0.02 and np.quantile(far, 0.95) < 0.06
 
 
-def test_joints_flow_through_a_pipe(few_truth, few, dpc):
-    found = dpc("segment", "joints", few, "-o", "-")
+def test_joints_flow_through_a_pipe(few_truth, few):
+    found = piped("segment", "joints", few, "-o", "-")
     assert found.returncode == 0, found.stderr
-    scored = dpc("evaluate", "joints", "-", "--truth", few_truth, "--split", "all", "--json", stdin=found.stdout)
+    scored = piped("evaluate", "joints", "-", "--truth", few_truth, "--split", "all", "--json", stdin=found.stdout)
     assert scored.returncode == 0 and json.loads(scored.stdout)["metrics"]["type"] > 0.8, scored.stderr
 
 

@@ -9,9 +9,10 @@ import pytest
 
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.parts import PartsReader
+from tests.support.commands import piped
 
 
-def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc_here, data, run_folder, tmp_path, dpc):
+def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc_here, data, run_folder, tmp_path):
     predict = ("segment", "predict", data, "--model", run_folder, "--flow", "nearest", "--points", 48, "--pairs", "all")
     done = dpc_here(
         *predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply"
@@ -20,9 +21,9 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc_here, data, run_folde
     assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(
         list((tmp_path / "ply").rglob("*.ply"))
     ) == 18
-    piped = dpc(*predict, "-o", "-")
-    assert piped.returncode == 0
-    judged = dpc("evaluate", "segmentation", "-", "--truth", data, "--json", stdin=piped.stdout)
+    through = piped(*predict, "-o", "-")
+    assert through.returncode == 0
+    judged = piped("evaluate", "segmentation", "-", "--truth", data, "--json", stdin=through.stdout)
     assert judged.returncode == 0, judged.stderr.decode()
     with PartsReader(tmp_path / "parts.h5") as reader:
         assert len(reader) == 6 and reader.num_parts == 8
