@@ -81,9 +81,8 @@ demo: $(READY)
 	@echo "The 4D scene: open demo/scene.html in a browser, or demo/scene.mp4."
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png, demo/parts.gif and demo/scene.png."
 
-# Bytecode is kept even where the environment says not to: each of the three else rewrites every test's asserts, 25 s in all.
 test: lint
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 # Chapter 3 and appendix A (docs/reproduce.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
 # PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video
