@@ -65,7 +65,8 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
         cloud.unread += without(list(arrays), alike)
         return cloud
     if key is None:
-        raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
+        held = [f"{name} (a pickle)" if one.dtype.hasobject else name for name, one in arrays.items()]
+        raise DataError(f"{path}: arrays {', '.join(held) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
     color_key, rows = next((k for k in _COLOR_KEYS if k in arrays), ""), len(cloud.points)
     if color_key:

@@ -282,3 +282,17 @@ def test_the_corners_of_a_mesh_are_no_points(tmp_path, corners):
     np.savez(tmp_path / "n.npz", **{corners: faces})
     with pytest.raises(DataError, match="expected one called points"):
         read_npz(tmp_path / "n.npz")
+
+
+def test_objects_beside_one_cloud_are_named_and_not_loaded(tmp_path):
+    points, objects = np.random.default_rng(3).normal(size=(20, 3)), np.array([{"frame": 1}, print], object)
+    np.savez(tmp_path / "a.npz", points=points, about=objects)
+    cloud = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert cloud.unread == ("about",)
+    np.savez(tmp_path / "b.npz", points=objects)
+    with pytest.raises(DataError, match="expected numbers"):
+        read_npz(tmp_path / "b.npz")
+    np.savez(tmp_path / "c.npz", about=objects)
+    with pytest.raises(DataError, match=r"arrays about \(a pickle\)"):
+        read_npz(tmp_path / "c.npz")
