@@ -35,7 +35,7 @@ _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
 class _NoNumbersError(DataError):
-    """An array of objects that holds other things than arrays of numbers."""
+    """Tells that an array of objects holds other things than arrays of numbers."""
 
 
 class ByName(dict[str, Content]):
