@@ -45,14 +45,20 @@ def require_distinct(path: object, names: Sequence[str]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a `.npz` by name; other files in the archive are passed over.
+    """Returns the arrays of a `.npz` by name; other files in the archive are passed over, and an array of objects, a pickle that
+    may hold anything, stays without axes and values, so that it can be named.
 
-    Raises DataError when it is damaged, needs a pickle, or an array has other bytes than its header says.
+    Raises DataError when the file is damaged, or an array has other bytes than its header says.
     """
     with reading(path), open_archive(path) as archive:
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-        return {one.filename[: -len(".npy")]: read_member(path, archive.read(one)) for one in members}
+        arrays = {}
+        for one in members:
+            data = archive.read(one)
+            is_pickle = read_header(io.BytesIO(data))[2].hasobject
+            arrays[one.filename[: -len(".npy")]] = np.empty((), object) if is_pickle else read_member(path, data)
+        return arrays
 
 
 def read_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:

@@ -24,7 +24,7 @@ Columns = dict[str, np.ndarray]
 class ArrayTable:
     """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
-    Raises DataError where the file holds none, or several.
+    by_name: the columns as stored. Raises DataError where the file holds none, or several.
     """
 
     cut: Mapping[str, int] = {}  # numbers that no text holds have all their digits
@@ -37,8 +37,8 @@ class ArrayTable:
                 f"{path}: holds {told}; expected one: write it as .csv or .parquet (pandas: DataFrame.to_csv)"
             )
         self.path = path
-        ((self._columns, self._units),) = found.values()
-        self.names = tuple(self._columns)
+        ((self.by_name, self._units),) = found.values()
+        self.names = tuple(self.by_name)
         axes: list[int] = []
         with suppress(DataError):  # reading says which names could be the same
             axes, _ = find_axes(self.names) or (axes, "")
@@ -48,16 +48,16 @@ class ArrayTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
-        chosen = [self._columns[self.names[place]] for place in places]
+        chosen = [self.by_name[self.names[place]] for place in places]
         for place, column in zip(places, chosen):
             if column.dtype.kind not in "uifb":
                 raise DataError(f"{self.path}: column {self.names[place]!r} holds no numbers ({column.dtype})")
-        rows = len(next(iter(self._columns.values())))
+        rows = len(next(iter(self.by_name.values())))
         return np.stack([column.astype(np.float64) for column in chosen], axis=1) if chosen else np.zeros((rows, 0))
 
     def words(self, place: int) -> list[str]:
         """Returns the cells of a column as text."""
-        cells = self._columns[self.names[place]].tolist()
+        cells = self.by_name[self.names[place]].tolist()
         return [one.decode("utf-8", "replace") if isinstance(one, bytes) else str(one) for one in cells]
 
     def moments(self, place: int) -> np.ndarray | None:
@@ -65,7 +65,7 @@ class ArrayTable:
         unit of time; NaN where it is empty; None of others.
         """
         name = self.names[place]
-        column = self._columns[name]
+        column = self.by_name[name]
         if column.dtype.kind in "mM" and len(column):
             since = column.astype(f"{column.dtype.str[1]}8[ns]")
             known = ~np.isnat(since)

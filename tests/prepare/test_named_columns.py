@@ -93,6 +93,46 @@ def test_a_table_in_a_file_of_arrays_is_read_as_one_of_text(tmp_path, form):
     assert np.allclose(sample.time, np.arange(FRAMES) * 0.1)
 
 
+@pytest.mark.parametrize("form", ["table", "fixed"])
+def test_tables_of_single_clouds_are_read_by_the_names_of_their_columns(tmp_path, form):
+    """In a folder, too, where their first number isn't x, and beside the index of PyTables that was never written."""
+    for place in range(2):
+        write_pandas(tmp_path / f"{place}.h5", form)
+        with h5py.File(tmp_path / f"{place}.h5", "r+") as file:  # the column of whole numbers tells no frames here
+            item = file["df/table"].attrs if form == "table" else file["df"]
+            key, names = (
+                ("values_block_0_kind", pickle.dumps(["level"], 0)) if form == "table" else ("block0_items", "level")
+            )
+            del item[key]
+            item[key] = np.bytes_(names) if form == "table" else np.bytes_([names])
+            file.create_dataset("_i_table/index/indicesLR", (131072,), "i4", chunks=(1024,), compression="gzip")
+    run = told("prepare", "clouds", tmp_path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert not run.returncode and "1 sequence of 2 frames" in run.stderr, run.stderr
+    with CloudsReader(tmp_path / "out.h5") as reader:
+        sample = reader.read(0)
+    expected = np.float32(np.stack([COLUMNS[axis] for axis in "xyz"], axis=1))
+    assert np.array_equal(sample.points, np.concatenate([expected, expected]))
+
+
+@pytest.mark.parametrize("form", ["points", "x y z", "table"])
+def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form):
+    points = RNG.normal(size=(50, 3)) * 100
+    (tmp_path / "in").mkdir()
+    with h5py.File(tmp_path / "in/0.h5", "w") as file:
+        if form == "points":
+            file["points"] = points
+        elif form == "table":
+            file["points"] = np.rec.fromarrays(points.T, names="x,y,z")
+        else:
+            file["x"], file["y"], file["z"] = points.T
+        for item in file.values():
+            item.attrs["units"] = "mm"
+    run = told("prepare", "clouds", tmp_path / "in", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert not run.returncode and "converted from mm to m" in run.stderr, run.stderr
+    with CloudsReader(tmp_path / "out.h5") as reader:
+        assert np.allclose(reader.read(0).points, points / 1000)
+
+
 @pytest.mark.parametrize("form", ["npy", "npz columns", "npz points", "h5 records"])
 def test_further_columns_and_sequences_are_taken_where_that_is_asked_for(tmp_path, form):
     reader = TableSequences(write(tmp_path, form), sequence_column="frame", frame_column="t", keep=("snr",))
@@ -102,7 +142,7 @@ def test_further_columns_and_sequences_are_taken_where_that_is_asked_for(tmp_pat
     assert np.array_equal(np.concatenate(kept), COLUMNS["snr"])
 
 
-@pytest.mark.parametrize("column", ["npy", "npz columns", "npz points"])
+@pytest.mark.parametrize("column", ["npy", "npz columns", "npz points", "h5 table", "h5 fixed", "h5 records"])
 def test_a_folder_of_tables_is_not_taken_for_frames(tmp_path, column):
     """Each row of which would lose its frame."""
     (tmp_path / "in").mkdir()
@@ -112,7 +152,7 @@ def test_a_folder_of_tables_is_not_taken_for_frames(tmp_path, column):
     run = told(*words)
     assert run.returncode == 3 and "'frame' numbers 6 frames; --frame-column frame makes them a sequence" in run.stderr
     run = told(*words, "--frame-column", "frame")
-    assert not run.returncode and "2 sequences in 2 tables" in run.stderr
+    assert not run.returncode and "2 sequences in 2 tables" in run.stderr and "left out" not in run.stderr
 
 
 def test_units_of_columns_count(tmp_path):

@@ -29,7 +29,7 @@ POINT_KEYS = (
     "verts",
 )
 _BESIDE = re.compile(
-    r"(.*[/_.])?(normals?|colou?rs?|rgb|flows?|scene_?flow|veloc\w*|vel|feat\w*|faces?|triangles|edges|weights?|masks?|valid|"
+    r"(.*[/_.])?(normals?|colou?rs?|rgb|flows?|scene_?flow|veloc\w*|vel|feat\w*|faces?|triangles|edges|weights?|masks?|valids?|"
     r"poses?|transforms?|rotations?|trans\w*|(in|ex)trinsics?|cameras?|joints?_?(names|parents)|images?|depths?|labels?|y|times?|"
     r"time_?stamps?|intensit\w*|reflect\w*)",
     re.IGNORECASE,
@@ -39,7 +39,7 @@ _TIMES = re.compile(
 )
 _COLORS = re.compile(r"colou?rs?|rgb", re.IGNORECASE)
 _MASKS = re.compile(  # of valid points: those of padding, ground, persons and the like are none
-    r"(((points?|pts|xyz|cloud|pc)_?)?(masks?|is_?valid|valid(ity)?)|(valid|masks?)_?(masks?|points?|pts|xyz|cloud|pc))",
+    r"(((points?|pts|xyz|cloud|pc)_?)?(masks?|is_?valid|valids?|validity)|(valid|masks?)_?(masks?|points?|pts|xyz|cloud|pc))",
     re.IGNORECASE,
 )
 _FRAME_COUNTS = re.compile(

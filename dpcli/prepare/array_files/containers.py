@@ -25,12 +25,17 @@ SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
+_ROWS_OF_CAMERA = 4  # of the largest arrays that tell of a camera, and of no points
 _MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
 PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
 _names: dict[tuple[Path, int, int], ByName[str]] = {}  # arrays in the HDF5 file opened last, and where they lie
 Content = TypeVar("Content")
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
+
+
+class _NoNumbersError(DataError):
+    """Tells that an array of objects holds other things than arrays of numbers."""
 
 
 class ByName(dict[str, Content]):
@@ -435,12 +440,20 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
     with reading(path), open_archive(path) as archive:
         require_room(path, sum(info.file_size for info in archive.infolist()))
         members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-        arrays = {one.filename[: -len(".npy")]: _member(path, archive.read(one)) for one in members}
-    return ByName(
-        (name, array)
-        for name, array in arrays.items()
-        if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names
-    )
+        arrays, foreign = {}, None
+        for one in members:
+            try:
+                array = _member(path, archive.read(one))
+            except (
+                _NoNumbersError
+            ) as error:  # pictures, names or settings beside the clouds, or the clouds in another form
+                foreign = foreign or error
+                continue
+            if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names:
+                arrays[one.filename[: -len(".npy")]] = array
+    if foreign and not any(isinstance(one, list) or one.ndim and len(one) > _ROWS_OF_CAMERA for one in arrays.values()):
+        raise foreign
+    return ByName(arrays)
 
 
 def _npy(path: Path) -> np.ndarray | list[np.ndarray]:
@@ -469,7 +482,7 @@ def _member(path: Path, data: bytes) -> np.ndarray | list[np.ndarray]:
     try:
         objects = load_arrays(stream)
     except pickle.UnpicklingError as error:
-        raise DataError(f"{path}: a pickle that is not of plain arrays: {error}; it was not loaded") from None
+        raise _NoNumbersError(f"{path}: a pickle that is not of plain arrays: {error}; it was not loaded") from None
     except Exception as error:  # a damaged pickle stream raises nearly anything
         raise DataError(f"{path}: cannot be read ({type(error).__name__}: {error}); copy it again") from None
     objects = objects.item() if isinstance(objects, np.ndarray) and objects.shape == () else objects
@@ -480,5 +493,5 @@ def _member(path: Path, data: bytes) -> np.ndarray | list[np.ndarray]:
             pass
     parts = list(objects) if isinstance(objects, (np.ndarray, list, tuple)) else [objects]
     if not all(isinstance(one, np.ndarray) and one.dtype.kind in "uif" for one in parts):
-        raise DataError(f"{path}: a pickle of other things than arrays of numbers; save the clouds as arrays")
+        raise _NoNumbersError(f"{path}: a pickle of other things than arrays of numbers; save the clouds as arrays")
     return [np.array(one, one.dtype) for one in parts]  # plain arrays, whatever the pickle's

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
-from dpcli.prepare.array_files.containers import open_arrays
+from dpcli.prepare.array_files.containers import open_arrays, tables_inside, told_units
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -19,7 +19,8 @@ from dpcli.prepare.cloud_formats.cloud import (
     unnamed_columns,
     without,
 )
-from dpcli.prepare.cloud_formats.column_names import find_frame_column
+from dpcli.prepare.cloud_formats.column_names import find_frame_column, unit_of_comments
+from dpcli.prepare.named_columns import ArrayTable, holds_table
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -38,15 +39,33 @@ def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 
 def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
-    """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
-    return _cloud_of_arrays(path, read_arrays(path), keep)
+    """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some; or the only structured one."""
+    arrays = read_arrays(path)
+    records = [name for name, one in arrays.items() if one.dtype.names]
+    if len(records) == 1 and not _has_points(arrays):
+        cloud = _cloud_of_array(path, arrays[records[0]], keep)
+        cloud.unread += without(list(arrays), records)
+        return cloud
+    return _cloud_of_arrays(path, arrays, keep)
 
 
 def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
-    """Reads a MATLAB or HDF5 file of one cloud as `read_npz` reads its arrays."""
+    """Reads a MATLAB or HDF5 file of one cloud as `read_npz` reads its arrays, or the rows of the only table in it."""
+    if holds_table(path):
+        table = ArrayTable(path)
+        _refuse_frames(path, table.by_name)
+        cloud = cloud_of_columns(path, table.by_name, keep)
+        cloud.unit = cloud.unit or table.unit
+        return cloud
     with open_arrays(path) as arrays:
         plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
-    return _cloud_of_arrays(path, {name: _as_vector(name, one) for name, one in plain.items()}, keep)
+        if not plain and tables_inside(path):
+            ArrayTable(path)  # says that there are several
+        told = {name: unit_of_comments([f"units: {told_units(arrays[name])}"]) for name in plain}
+    cloud = _cloud_of_arrays(path, {name: _as_vector(name, one) for name, one in plain.items()}, keep)
+    units = {told[name] for name in cloud.columns[:3]} - {""}
+    cloud.unit = cloud.unit or (units.pop() if len(units) == 1 else "")
+    return cloud
 
 
 def _as_vector(name: str, array: np.ndarray) -> np.ndarray:
@@ -65,8 +84,10 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
         cloud.unread += without(list(arrays), alike)
         return cloud
     if key is None:
-        raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
+        held = [f"{name} (a pickle)" if one.dtype.hasobject else name for name, one in arrays.items()]
+        raise DataError(f"{path}: arrays {', '.join(held) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
+    cloud.columns = (key,)
     color_key, rows = next((k for k in _COLOR_KEYS if k in arrays), ""), len(cloud.points)
     if color_key:
         color = arrays[color_key]
@@ -91,7 +112,12 @@ def _refuse_frames(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         )
 
 
-def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
+def _has_points(arrays: Mapping[str, np.ndarray]) -> bool:
+    called = any(name in arrays for name in _POINT_KEYS) or {"x", "y", "z"} <= arrays.keys()
+    return called or _only_points(arrays) is not None
+
+
+def _only_points(arrays: Mapping[str, np.ndarray]) -> str | None:
     """Returns the name of the only array that can be points, numbers (N,3 or more); None when none or several can."""
     others = (*_COLOR_KEYS, "normal", "normals", *_CORNERS)
     numbers = {k: a for k, a in arrays.items() if a.dtype.kind in "uif" and k not in others}

@@ -11,10 +11,30 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, reading
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.column_names import find_axes
 
 COLUMNAR = (".parquet", ".feather", ".arrow")
 _CELL = 8  # bytes of a number
 _DAY = 86_400.0  # seconds
+_QUATERNION = {"qw", "qx", "qy", "qz"}
+
+
+def is_pose_table(path: Path) -> bool:
+    """Returns whether the columns of a Parquet or Feather file are called quaternions and no x, y and z, as those of Argoverse 2
+    beside its clouds; the rows aren't read, and False is returned where the columns can't be.
+    """
+    try:
+        import pyarrow.ipc
+        import pyarrow.parquet
+
+        if path.suffix.lower() == ".parquet":
+            names = pyarrow.parquet.read_schema(path).names
+        else:
+            with pyarrow.memory_map(str(path)) as file:
+                names = pyarrow.ipc.open_file(file).schema.names
+        return _QUATERNION <= set(names) and find_axes(names) is None
+    except Exception:  # reading says what is wrong: no pyarrow, another form of Feather, damage, twice the same name
+        return False
 
 
 class ParquetTable:

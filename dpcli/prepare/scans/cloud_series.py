@@ -13,6 +13,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.parquet import COLUMNAR, is_pose_table
 from dpcli.prepare.decode.cloud_files import HDF5, MESHES
 from dpcli.prepare.decode.folder_listing import count_suffixes, stores, walk_folders
 from dpcli.prepare.reader import natural_key
@@ -77,10 +78,9 @@ def find_sequences(
     for folder, names, foreign in _folders(root, suffixes, table.resolve() if table else None):
         foreigners += foreign
         series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED) if names else None
-        if series and is_pose(series.paths[0]):
-            poses.append(series)
-        elif series:
-            found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
+        if series:
+            series = replace(series, left_out=(*series.left_out, *_counted(foreign)))
+            (poses if is_pose(series.paths[0]) else found).append(series)
         else:
             where = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
             alone += [f"{where}{one}" for one in (*sorted(filter(is_beside, names)), *_counted(foreign))]
@@ -129,7 +129,11 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: l
     logs = {one: None for one in found if is_log(one)}
     logs = {} if len(logs) == len(found) else logs
     first, *others = [one for one in found if one not in logs]
-    named = sorted((one.folder / one.described()).relative_to(root).as_posix() for one in (*poses, *logs))
+    named = sorted(
+        (one.folder / name).relative_to(root).as_posix()
+        for one in (*poses, *logs)
+        for name in (one.described(), *one.left_out)
+    )
     return [replace(first, left_out=(*first.left_out, *named, *alone)), *others]
 
 
@@ -184,10 +188,13 @@ def is_cloud(name: str, suffixes: Sequence[str]) -> bool:
 
 
 def is_pose(path: Path) -> bool:
-    """Returns whether a text holds the pose of a camera, or those of its way: no cloud.
+    """Returns whether a text or table holds the pose of a camera, or those of its way: no cloud.
 
-    That is a 4x4 or 3x4 matrix that turns, one in each row, or rows that end with a quaternion, as KITTI and TUM have them.
+    In a text that is a 4x4 or 3x4 matrix that turns, one in each row, or rows that end with a quaternion, as KITTI and TUM have
+    them; in a table (Parquet, Feather) the names tell.
     """
+    if path.suffix.lower() in COLUMNAR:
+        return is_pose_table(path)
     return path.suffix.lower() in TEXTS and all(_begins_with_poses(path, count) for count in _LOOKED_AT)
 
 

@@ -198,7 +198,8 @@ class TableSequences(OwnScans):
                 )
         pieces = [name for name in self._paths if _PIECE.fullmatch(name)]
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
-        lines += left_out_below(self.raw, TABLES)
+        read = {path.suffix.lower() for path in self._paths.values()}
+        lines += left_out_below(self.raw, (*TABLES, *read))
         return lines + (self._table.unnamed(items) if self._table else [])
 
 

@@ -226,6 +226,20 @@ def test_a_pickle_of_code_is_not_loaded(tmp_path):
         read(tmp_path / "bad.npy")
 
 
+@pytest.mark.parametrize("beside", [b"pictures", {"fps": 30}, "names", np.datetime64("2024-03-05"), print])
+def test_objects_beside_the_clouds_are_named_and_not_loaded(tmp_path, capsys, beside):
+    """TAPVid-3D keeps its pictures so; where there are no other numbers, or only a camera, the objects are said to be none."""
+    clouds, objects = tracked(7, 5, 30), np.empty(5, object)
+    objects[:] = beside
+    np.savez(tmp_path / "a.npz", xyz=clouds, about=objects)
+    assert same(read(tmp_path / "a.npz")["a"], clouds)
+    assert "not read: about" in capsys.readouterr().err
+    np.savez(tmp_path / "b.npz", about=objects, K=np.eye(3))
+    with pytest.raises(DataError):
+        read(tmp_path / "b.npz")
+    assert "b.npz: a pickle" in capsys.readouterr().err
+
+
 def test_a_folder_of_arrays_passes_over_what_dpc_made(tmp_path):
     clouds = {name: tracked(k, 5, 30) for k, name in enumerate(("walk", "run"))}
     for name, frames in clouds.items():
@@ -360,7 +374,15 @@ def test_frames_behind_their_count_are_padding(tmp_path, name):
 
 @pytest.mark.parametrize(
     ("name", "used"),
-    [("mask", 1), ("point_mask", 1), ("valid", 1), ("padding_mask", 0), ("ground_mask", 0), ("fg_mask", 0)],
+    [
+        ("mask", 1),
+        ("point_mask", 1),
+        ("valid", 1),
+        ("valids", 1),
+        ("padding_mask", 0),
+        ("ground_mask", 0),
+        ("fg_mask", 0),
+    ],
 )
 def test_only_masks_of_valid_points_leave_points_out(tmp_path, name, used):
     """Others are named; a mask may have an axis for the coordinates."""

@@ -282,3 +282,37 @@ def test_the_corners_of_a_mesh_are_no_points(tmp_path, corners):
     np.savez(tmp_path / "n.npz", **{corners: faces})
     with pytest.raises(DataError, match="expected one called points"):
         read_npz(tmp_path / "n.npz")
+
+
+def test_objects_beside_one_cloud_are_named_and_not_loaded(tmp_path):
+    points, objects = np.random.default_rng(3).normal(size=(20, 3)), np.array([{"frame": 1}, print], object)
+    np.savez(tmp_path / "a.npz", points=points, about=objects)
+    cloud = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert cloud.unread == ("about",)
+    np.savez(tmp_path / "b.npz", points=objects)
+    with pytest.raises(DataError, match="expected numbers"):
+        read_npz(tmp_path / "b.npz")
+    np.savez(tmp_path / "c.npz", about=objects)
+    with pytest.raises(DataError, match=r"arrays about \(a pickle\)"):
+        read_npz(tmp_path / "c.npz")
+
+
+def test_the_only_structured_array_of_an_npz_is_the_cloud(tmp_path):
+    points, level = np.random.default_rng(4).normal(size=(20, 3)), np.arange(20) / 3
+    records = np.rec.fromarrays([level, *points.T], names="level,x,y,z")
+    np.savez(tmp_path / "a.npz", records, labels=np.arange(20))
+    cloud = read_npz(tmp_path / "a.npz", keep=["level"])
+    np.testing.assert_array_equal(cloud.points, points)
+    np.testing.assert_array_equal(cloud.extra["level"], level)
+    assert cloud.unread == ("labels",)
+    np.savez(tmp_path / "b.npz", about=records, points=points + 1)
+    np.testing.assert_array_equal(read_npz(tmp_path / "b.npz").points, points + 1)
+
+
+def test_several_tables_in_a_file_of_one_cloud_are_named(tmp_path):
+    points = np.random.default_rng(4).normal(size=(20, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["lidar"] = file["radar"] = np.rec.fromarrays(points.T, names="x,y,z")
+    with pytest.raises(DataError, match=r"holds several tables \(lidar, radar\)"):
+        read_cloud(tmp_path / "a.h5")

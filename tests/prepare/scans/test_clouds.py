@@ -404,6 +404,31 @@ def test_what_lies_in_folders_without_clouds_is_named(tmp_path, rest):
     assert rest.rpartition("/")[0] in told and (rest in told or f"1 {rest[rest.index('.') :]} file" in told)
 
 
+@pytest.mark.parametrize("form", ["feather", "parquet"])
+def test_tables_of_poses_beside_clouds_are_no_clouds(tmp_path, form):
+    """As in Argoverse 2: they are named, with what lies beside them, and the clouds keep the times in their names."""
+    pyarrow = pytest.importorskip("pyarrow")
+    write = pytest.importorskip(f"pyarrow.{form}")
+    write = write.write_feather if form == "feather" else write.write_table
+    pose = {name: [1.0, 0.5] for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    for name in ("city_SE3_egovehicle", "calibration/egovehicle_SE3_sensor"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write(pyarrow.table(pose), str(tmp_path / f"{name}.{form}"))
+    write(pyarrow.table({"category": ["BUS"], "tx_m": [1.0]}), str(tmp_path / f"annotations.{form}"))
+    (tmp_path / "sensors/lidar").mkdir(parents=True)
+    points = np.random.default_rng(2).normal(size=(20, 3))
+    for stamp in (315966070559696000, 315966070659696000):
+        columns = dict(zip("xyz", points.T)) | {"qw": points[:, 0]}  # a rotation of each point makes it no pose
+        columns |= {name: points[:, 1] for name in ("qx", "qy", "qz")}
+        write(pyarrow.table(columns), str(tmp_path / f"sensors/lidar/{stamp}.{form}"))
+    reader = CloudFolders(tmp_path)
+    (item,) = reader.items()
+    sample = reader.read(item, np.random.default_rng(0)).sequence
+    assert np.allclose(sample.points, np.tile(points, (2, 1))) and np.allclose(sample.time, [0, 0.1])
+    told = reader.summary([item])[1].partition("left out: ")[2]
+    assert all(word in told for word in ("annotations", "calibration/egovehicle_SE3_sensor", "city_SE3_egovehicle"))
+
+
 @pytest.mark.parametrize(
     ("at", "size", "told"), [(2100.7, 300, True), (600.3, 80, True), (2.1, 0.4, False), (40.0, 30, False)]
 )
