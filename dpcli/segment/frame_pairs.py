@@ -31,12 +31,14 @@ class Pair:
 class LoadedPair:
     """Holds one pair. points f32 (2,N,3): in units of the two frames' diameter, centered; part i64 (2,N): -1 unknown.
 
-    flow f32 (2,N,3): the true one each way, None without poses and scene_flow.
+    flow f32 (2,N,3): the true one each way, None without poses and scene_flow. known bool (2,N): where it is true, which
+    poses don't tell of points of unknown part.
     """
 
     points: np.ndarray
     part: np.ndarray
     flow: np.ndarray | None
+    known: np.ndarray
 
 
 def sequence_scale(frames: list[np.ndarray]) -> float:
@@ -121,22 +123,18 @@ class PairSource:
         points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
         parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
         if isinstance(self.reader, PartsReader):
-            said = self.reader.read_parts(pair.sequence)
+            said = self.reader.read_parts_between(pair.sequence, pair.first, pair.first + 2)
             flow = _predicted_flow(said, pair, points, parts, f"{self.reader.path}: {sample.name!r}")
-            parts = np.where(self._sure(said, pair, picks), parts, -1)
+            sure = np.split(said.probability.max(1) >= _SURE, [len(clouds[0])])
+            parts = np.where(np.stack([own[pick] for own, pick in zip(sure, picks)]), parts, -1)
         else:
             flow = self._flow(pair, sample, points, parts, picks)
         scale = sequence_scale(clouds)
         center = np.float32(points.mean((0, 1)))
+        known = parts >= 0 if sample.scene_flow is None else np.ones(parts.shape, bool)
         return LoadedPair(
-            np.float32((points - center) * scale), parts, None if flow is None else np.float32(flow * scale)
+            np.float32((points - center) * scale), parts, None if flow is None else np.float32(flow * scale), known
         )
-
-    def _sure(self, said: PartsSample, pair: Pair, picks: list[np.ndarray]) -> np.ndarray:
-        """Returns whether the likeliest part of each chosen point (2,N) is as likely as `_SURE`."""
-        first = int(self.reader.frame_counts[: pair.sequence].sum())
-        ends = np.cumsum([0, *self.reader.frame_sizes[first : first + pair.first + 2]])[pair.first :]
-        return np.stack([said.probability[end + pick].max(1) >= _SURE for end, pick in zip(ends, picks)])
 
     def _flow(
         self, pair: Pair, sample: CloudSequence, points: np.ndarray, parts: np.ndarray, picks: list[np.ndarray]
@@ -155,8 +153,8 @@ class PairSource:
 
 
 def _predicted_flow(said: PartsSample, pair: Pair, points: np.ndarray, parts: np.ndarray, where: str) -> np.ndarray:
-    """Returns the flow (2,N,3) that the predicted motions give points of parts (2,N), each way."""
-    known = np.flatnonzero((said.pairs == [pair.first, pair.first + 1]).all(1))
+    """Returns the flow (2,N,3) that the predicted motions, of the pair's frames alone, give points of parts (2,N), each way."""
+    known = np.flatnonzero((said.pairs == [0, 1]).all(1))
     if not len(known):
         raise DataError(f"{where} has no motion from frame {pair.first} to {pair.first + 1}; predict it again")
     motion = said.motion[known[0]].astype(np.float64)

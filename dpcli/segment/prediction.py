@@ -63,7 +63,7 @@ def predict_parts(
     frames = _prepare_frames(clouds, index, options, seed, tracks)
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
     pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
-    masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options)
+    masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options, sequence.name)
     full = masks
     if frames.tracks is None:
         full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
@@ -154,6 +154,7 @@ def _find_masks_and_motions(
     segmenter: FrameSegmenter | MultibodySegmenter,
     estimate: Estimate,
     options: Refinement,
+    name: str,
 ) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
     """Returns the masks (N_t,S) and for every pair the motions (S,3,3), (S,3).
 
@@ -162,7 +163,7 @@ def _find_masks_and_motions(
     if isinstance(segmenter, MultibodySegmenter):
         threads, origin = torch.get_num_threads(), tuple(-frames.scale * frames.center)
         with torch_threads(1):
-            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks, origin, threads)
+            masks, motions = segmenter.explain(frames.thin, pairs, frames.tracks, origin, threads, name)
         return masks, [motions[pair] for pair in pairs]
     flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
     masks = _refine_masks(frames.thin, flows, masks, options)

@@ -214,19 +214,33 @@ class PartsReader(CloudsReader):
     def read_parts(self, index: int) -> PartsSample:
         """Reads what is said of sequence `index`; raises DataError when its values don't fit the sequence."""
         with reading(self.path):
-            return self._read_parts(index)
+            return self._read_parts(index, 0, int(self.frame_counts[index]))
 
-    def _read_parts(self, index: int) -> PartsSample:
-        frames = self._frame_offsets[self._sequence_offsets[index] : self._sequence_offsets[index + 1] + 1]
+    def read_parts_between(self, index: int, first: int, end: int) -> PartsSample:
+        """Reads what `read_parts` does, but of the frames `first` to `end` - 1 and the pairs among them alone.
+
+        Its pairs count frames from `first`.
+        """
+        with reading(self.path):
+            return self._read_parts(index, first, end)
+
+    def _read_parts(self, index: int, first: int, end: int) -> PartsSample:
+        start = int(self._sequence_offsets[index])
+        frames = self._frame_offsets[start + first : start + end + 1]
         points = slice(int(frames[0]), int(frames[-1]))
-        pairs = slice(*map(int, self._pair_offsets[index : index + 2]))
-        offsets = self._flow_offsets[pairs.start : pairs.stop + 1]
-        flow = self._set("flow")[int(offsets[0]) : int(offsets[-1])]
+        begin, stop = map(int, self._pair_offsets[index : index + 2])
+        pairs = self._set("pair")[begin:stop]
+        chosen = np.arange(len(pairs))
+        if end - first < self.frame_counts[index]:
+            chosen = np.flatnonzero(((pairs >= first) & (pairs < end)).all(1))
+        low, high = (int(chosen[0]), int(chosen[-1]) + 1) if len(chosen) else (0, 0)
+        offsets = self._flow_offsets[begin + low : begin + high + 1]
+        flow = np.split(self._set("flow")[int(offsets[0]) : int(offsets[-1])], offsets[1:-1] - offsets[0])
         said = PartsSample(
             self._set("part_probability")[points],
-            self._set("pair")[pairs],
-            self._set("part_motion")[pairs],
-            np.split(flow, offsets[1:-1] - offsets[0]) if pairs.stop > pairs.start else [],
+            pairs[chosen] - np.int32(first),
+            self._set("part_motion")[begin + low : begin + high][chosen - low],
+            [flow[i] for i in chosen - low],
         )
         sequence = CloudSequence(
             self.names[index],

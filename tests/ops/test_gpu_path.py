@@ -131,6 +131,32 @@ def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("command", ["predict", "train"])
+def test_a_trained_estimator_of_flow_runs_where_the_command_does(card, command, dpc_here, tmp_path):
+    from dpcli.segment.flow.model_file import load_flow_model
+
+    data, estimator = drawers(tmp_path / "clouds.h5", 3), tmp_path / "flow"
+    words = ("--steps", 1, "--batch", 1, "--set", "points=32", "--set", "iterations=1", "--device", "cpu")
+    done = dpc_here("segment", "flow", data, "-o", estimator, *words)
+    assert done.returncode == 0, done.stderr
+    words = ("--method", "ward", "--points", 48, "--split", "test")
+    if command == "train":
+        words = ("--points", 48, "--batch", 1, "--epochs", 1, "--set", "pairs_per_epoch=1")
+    for device in ("cuda", "cpu"):
+        made = tmp_path / (f"{device}.h5" if command == "predict" else device)
+        done = dpc_here("segment", command, data, "-o", made, *words, "--flow", estimator, "--device", device)
+        assert done.returncode == 0, done.stderr
+        used, _ = load_flow_model(estimator)
+        assert next(used.parameters()).device.type == device
+    if command == "predict":
+        found = [PartsReader(tmp_path / f"{device}.h5").read_parts(0).flow for device in ("cuda", "cpu")]
+        np.testing.assert_allclose(*map(np.concatenate, found), atol=1e-4)
+    else:
+        found = [np.load(tmp_path / device / "flows_first.npy") for device in ("cuda", "cpu")]
+        assert np.abs(found[0]).max() > 0
+        np.testing.assert_allclose(*found, atol=1e-4)
+
+
 def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, tmp_path):
     data, model = drawers(tmp_path / "clouds.h5", 3), tmp_path / "model"
     words = ["pairs_per_epoch=2" if word == "pairs_per_epoch=6" else word for word in TRAIN_PARTS]

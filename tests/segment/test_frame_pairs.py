@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from dpcli.errors import DataError
 from dpcli.segment.frame_pairs import PairSource, backward_flow, without_strays
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader, PartsWriter
 from tests.support.drawers import drawer, predicted
 
 
@@ -83,6 +84,67 @@ def test_a_pose_without_an_inverse_is_bad_data(tmp_path):
     with CloudsReader(tmp_path / "d.h5") as reader, pytest.raises(DataError, match="d: a pose is not a rigid motion"):
         source = PairSource(reader, [0], 20, 0)
         source.load(source.pairs[0])
+
+
+def test_points_of_unknown_part_count_in_no_flow_error(tmp_path):
+    """Poses don't tell how they move: the error of no motion at all is that of the points whose part is known."""
+    from types import SimpleNamespace
+
+    from dpcli.segment.flow.trainer import FlowTrainer
+    from dpcli.segment.training.trainer import Trainer
+
+    sources = []
+    for name in ("whole", "half", "none"):
+        sequence = drawer("d", 0)
+        sequence.part[sequence.part >= {"whole": 2, "half": 1, "none": 0}[name]] = -1
+        with CloudsWriter(tmp_path / f"{name}.h5", fields=["part", "pose"]) as writer:
+            writer.write(sequence)
+        sources.append(PairSource(CloudsReader(tmp_path / f"{name}.h5"), [0], 48, 3))
+    whole, half = ([source.load(pair) for pair in source.pairs] for source in sources[:2])
+    for pairs, source, most in ((whole, sources[0], 2), (half, sources[1], 1), ([], sources[2], 0)):
+        norms = [np.linalg.norm(own.flow, axis=-1)[own.part < most] for own in whole] if most else []
+        counted: dict[str, float] = {}
+        loaded = pairs or [source.load(pair) for pair in source.pairs]
+        Trainer._measure_flow_error(SimpleNamespace(_count=counted.update), torch.zeros(2, 2, 48, 3), loaded)
+        assert counted == ({"flow_error": pytest.approx(np.concatenate(norms).mean(), rel=1e-5)} if most else {})
+        judge = SimpleNamespace(held=source, model=_Still(), device=torch.device("cpu"))
+        _, error = FlowTrainer._validate(judge)
+        forth = [np.linalg.norm(own.flow[0], axis=-1)[own.part[0] < most].mean() for own in whole] if most else []
+        assert error == (pytest.approx(np.mean(forth), rel=1e-5) if most else None)
+
+
+class _Still(torch.nn.Module):
+    """Says that nothing moves."""
+
+    def forward(self, first, second):
+        return [torch.zeros_like(first)]
+
+
+def test_a_pair_of_a_prediction_is_read_alone(tmp_path):
+    """What is read of two frames is what they are in the whole, whatever pairs of frames the file tells."""
+    sequence = drawer("d", 0, frames=5)
+    sizes = np.diff(sequence.frame_offsets)
+    rng = np.random.default_rng(0)
+    said = np.array([(i, j) for i in range(5) for j in range(5) if i != j], np.int32)[rng.permutation(20)[:17]]
+    motion = np.tile(np.eye(4), (17, 2, 1, 1))
+    motion[:, :, :3, 3] = rng.normal(size=(17, 2, 3))
+    flow = [rng.normal(size=(sizes[i], 3)) for i, _ in said]
+    probability = rng.uniform(size=(len(sequence.points), 2))
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, fields=["part"]) as writer:
+        for name in ("before", "d"):
+            sequence.name, sequence.pose = name, None
+            writer.write(sequence, probability, said, motion, flow)
+    with PartsReader(tmp_path / "p.h5") as reader:
+        whole = reader.read_parts(1)
+        for first, end in ((0, 5), (0, 2), (3, 5), (1, 4), (2, 3)):
+            own = reader.read_parts_between(1, first, end)
+            rows = [q for q, pair in enumerate(whole.pairs) if first <= pair.min() and pair.max() < end]
+            np.testing.assert_array_equal(own.pairs, whole.pairs[rows] - first)
+            np.testing.assert_array_equal(own.motion, whole.motion[rows])
+            assert [len(one) for one in own.flow] == [len(whole.flow[row]) for row in rows]
+            assert all((one == whole.flow[row]).all() for one, row in zip(own.flow, rows))
+            points = slice(*sequence.frame_offsets[[first, end]])
+            np.testing.assert_array_equal(own.probability, whole.probability[points])
 
 
 def test_a_prediction_gives_pairs_its_parts_and_motions(tmp_path):

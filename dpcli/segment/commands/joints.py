@@ -21,6 +21,7 @@ from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts,
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
 from dpcli.segment.multibody.axis_choice import with_point_axes
 from dpcli.store import CloudSequence, input_file, output_file
+from dpcli.store.joints import FIXED, PRISMATIC, REVOLUTE
 from dpcli.store.parts import PartsReader, PartsWriter
 from dpcli.store.schema import taken_for_meters
 
@@ -70,7 +71,7 @@ Trees = Generator[tuple[int, CloudSequence, KinematicTree], None, None]
 
 
 def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:
-    late, unseen = [], []
+    late, unseen, simplified = [], [], []
     with Progress("joints", len(chosen), "sequence") as progress:
         for number, index in enumerate(chosen):
             sequence = reader.read(index)
@@ -80,7 +81,10 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
             tree = with_point_axes(once, kinematic_tree(once, reader.read_parts(index)))
             counts.update(joint_counts(tree))
             late += [f"part {part} of {sequence.name}" for part in tree.trajectories.ids[~tree.trajectories.seen[0]]]
-            unseen += [f"part {child} on part {parent} of {sequence.name}" for child, parent in unseen_motions(tree)]
+            for told, kinds in ((unseen, (FIXED,)), (simplified, (REVOLUTE, PRISMATIC))):
+                told += [
+                    f"part {child} on part {parent} of {sequence.name}" for child, parent in unseen_motions(tree, kinds)
+                ]
             if picture is not None and number == 0:
                 joints_picture(picture, tree, sequence.name)
             yield index, sequence, tree
@@ -94,6 +98,11 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
         log.warn(
             f"{reader.path}: joints called fixed, since points don't show the motion that the file tells (too few, or alike"
             f" before and after it; more points may): {first_names(unseen)}"
+        )
+    if simplified:
+        log.warn(
+            f"{reader.path}: joints called hinge or slide, though the motion that the file tells is another one; points don't"
+            f" show the difference surely, and the joint may be free: {first_names(simplified)}"
         )
 
 

@@ -57,10 +57,11 @@ class Drawings:
 
 @dataclass(frozen=True)
 class PartsOfSequence:
-    """Finds the parts of one sequence; picklable, for worker processes."""
+    """Finds the parts of one sequence; picklable, for worker processes. device: where a trained estimator of flow runs."""
 
     segmenter: OncePerProcess[Segmenter]
     flow: str
+    device: str
     refinement: Refinement
     seed: int
     length_unit: str
@@ -68,7 +69,8 @@ class PartsOfSequence:
     def __call__(self, numbered: tuple[int, CloudSequence]) -> tuple[CloudSequence, PartsSample]:
         """Returns a sequence with its parts, and what else is said of it; its number in the file chooses the points."""
         index, sequence = numbered
-        segmenter, estimate = self.segmenter.get(), partial(estimate_flow_both_ways, method=self.flow)
+        segmenter = self.segmenter.get()
+        estimate = partial(estimate_flow_both_ways, method=self.flow, device=self.device)
         if isinstance(segmenter, SceneSegmenter):
             pairs = pairs_to_report(sequence.num_frames, self.refinement.pairs)
             labels, sample = segmenter.explain(sequence, pairs, self.length_unit)
@@ -113,7 +115,7 @@ def predict_file(
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
         flow = str(estimator.resolve() if estimator else flow)
-        work = PartsOfSequence(once, flow, refinement, seed, reader.length_unit)
+        work = PartsOfSequence(once, flow, str(choose_device(device)), refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         still = [reader.names[i] for i in sequences if reader.frame_counts[i] < 2]
         if still and settings.classical.method == "multibody":

@@ -70,7 +70,8 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
             f" {settings.schedule.epochs} epochs"
         )
         keep_freed_memory()
-        estimate = None if supervised else partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow))
+        flow = partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow), device=str(chosen))
+        estimate = None if supervised else flow
         with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
             folder.write_settings(CATALOG.to_toml(settings._asdict(), "segment train"))
             Trainer(model, folder, settings, training, validation, estimate, notes, stop, seed).run()

@@ -57,14 +57,17 @@ def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, devi
     return trained_flow(first, second, method, device)
 
 
-def estimate_flow_both_ways(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
+def estimate_flow_both_ways(
+    first: Tensor, second: Tensor, method: str, *, device: str = "cpu"
+) -> tuple[Tensor, Tensor]:
     """Returns the flow forth (N,3) and back (M,3) between two frames (N,3), (M,3), by the methods of `estimate_flow`.
 
     ICP runs once: its bodies' motions are inverted for the way back, and each point of frame 2 belongs to the body of
     the nearest point that was moved there, so that both frames tell of the same bodies.
     """
     if method != "icp":
-        forth, back = (estimate_flow(a[None], b[None], method=method)[0] for a, b in ((first, second), (second, first)))
+        both = ((first, second), (second, first))
+        forth, back = (estimate_flow(a[None], b[None], method=method, device=device)[0] for a, b in both)
         return forth, back
     from scipy.spatial import cKDTree
 

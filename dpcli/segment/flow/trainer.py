@@ -149,9 +149,9 @@ class FlowTrainer:
             first, second = torch.from_numpy(pair.points).to(self.device).unbind()
             flows = self.model(first[None], second[None])
             losses.append(float(flow_loss(first[None], second[None], flows)[0]))
-            if pair.flow is not None:
+            if pair.flow is not None and pair.known[0].any():
                 gap = flows[-1][0].cpu() - torch.from_numpy(pair.flow[0])
-                errors.append(float(gap.norm(dim=-1).mean()))
+                errors.append(float(gap.norm(dim=-1)[torch.from_numpy(pair.known[0])].mean()))
         self.model.train()
         return float(np.mean(losses)), float(np.mean(errors)) if errors else None
 

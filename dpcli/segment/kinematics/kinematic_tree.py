@@ -13,7 +13,7 @@ from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajec
 from dpcli.segment.kinematics.registration import Registration, register, relative_registration
 from dpcli.segment.kinematics.surface_directions import surface_directions
 from dpcli.store import CloudSequence, PartsSample
-from dpcli.store.joints import AXIS, FIXED, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
+from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
 _SURE = 0.05  # of the distance between neighboring points: no motion is known better
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
@@ -157,8 +157,8 @@ def _oriented(fits: dict[tuple[int, int], JointFit], parent: int, child: int) ->
     return replace(fit, value=-fit.value)
 
 
-def unseen_motions(tree: KinematicTree) -> list[tuple[int, int]]:
-    """Returns the parts (child, parent) whose joint is fixed although their motions differ by a quarter of the part's size.
+def unseen_motions(tree: KinematicTree, kinds: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Returns the parts (child, parent) whose joint, of one of some kinds, leaves out motion of a quarter of the part's size.
 
     Their points don't show it: they are few, or lie alike before and after, as those of a round part that spins.
     """
@@ -166,7 +166,7 @@ def unseen_motions(tree: KinematicTree) -> list[tuple[int, int]]:
     for joint in tree.joints:
         part = min((joint.child, joint.parent), key=lambda k: len(tree.points[k]))  # whose points the residual is of
         size = np.sqrt(tree.points[part].var(0).sum())
-        if joint.fit.kind == FIXED and joint.fit.residual > _UNSEEN * size:
+        if joint.fit.kind in kinds and joint.fit.residual > _UNSEEN * size:
             found.append((int(tree.trajectories.ids[joint.child]), int(tree.trajectories.ids[joint.parent])))
     return found
 

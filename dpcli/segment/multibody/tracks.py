@@ -18,6 +18,9 @@ _GUESSED = 0.02  # weight of a place where no frame shows the track
 _ROUNDS, _OWN = 3, 0.7  # in which tracks choose their parts again; share of their own deviation beside their neighbors'
 _WIDE, _STIFF = 9.0, 0.1  # squared deviation that counts one half: of the median; of the setting `flexible`, at least
 _WIDE_PAIR, _STIFF_PAIR = 4.0, 0.05  # the same where two parts may be one
+_JUMP, _ARRIVED = 1.5, 0.5  # spacings of tracks that one jumps at least, and within which it is at another's place
+_SETTLED = 5.0  # such distances in how far tracks are off in the median, where noise is more than spacing tells
+_CANDIDATES = 8  # frames, evenly spaced, whose places are compared with all others
 _REFITS, _LOST = 4, 0.2  # fits of one motion, without its outliers; share of a part's tracks that a union may lose
 
 
@@ -76,6 +79,74 @@ def _carried(before: np.ndarray, now: np.ndarray, both: np.ndarray, missing: np.
     start, end = before[both], now[both]
     near = cKDTree(start).query(before[missing], min(_AROUND, len(start)))[1].reshape(missing.sum(), -1)
     return move_each(fit_motions(start[near], end[near]), before[missing])
+
+
+def undo_exchanges(tracks: Tracks, part: np.ndarray) -> tuple[list[np.ndarray], int]:
+    """Returns `index` where tracks that exchanged their identities have them back, and how many points that concerns.
+
+    A track that goes with a part around it in most frames, by the parts i64 (M) that were found with the exchanges, has a
+    place in all frames. Two that are each at the other's place in a frame have exchanged their identities there.
+    """
+    from scipy.spatial import cKDTree
+
+    first = int(tracks.shown.sum(1).argmax())
+    place, index, undone = tracks.places[first], [], 0
+    spacing = float(np.median(cKDTree(place).query(place, 2)[0][:, -1])) if len(place) > 1 else 0.0
+    if not spacing > 0:
+        return tracks.index, 0
+    home, away = _places_in_parts(tracks, part, first, _JUMP * spacing)
+    usual = np.median(np.median(away, 0))
+    elsewhere = tracks.shown & (away > max(_JUMP * spacing, _SETTLED * usual))
+    elsewhere &= 2 * elsewhere.sum(0) <= tracks.shown.sum(0)
+    for t, own in enumerate(tracks.index):
+        names, moved = np.arange(len(part)), np.flatnonzero(elsewhere[t])
+        if len(moved):
+            gaps, taken = cKDTree(tracks.places[t, moved]).query(home[t, moved])
+            pairs = (taken[taken] == np.arange(len(moved))) & (np.maximum(gaps, gaps[taken]) < _ARRIVED * spacing)
+            names[moved[taken[pairs]]] = moved[pairs]
+        index.append(names[own])
+        undone += int((index[t] != own).sum())
+    return index, undone
+
+
+def _places_in_parts(tracks: Tracks, part: np.ndarray, first: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where every track would be in all frames if it went with the part around it with which it goes in most, f64 (F,M,3).
+
+    And how far it is from there, f64 (F,M), 0 where a frame doesn't show it. reach: as of `_most_frequent`.
+    """
+    several = {first, 0, len(tracks.places) // 2, len(tracks.places) - 1}  # in one of them a track may be elsewhere
+    near, sizes = part[np.concatenate([_near(tracks, t) for t in sorted(several)], 1)], np.bincount(part)
+    home, away, least = tracks.places.copy(), np.zeros(tracks.shown.shape), np.full(len(part), np.inf)
+    for k in np.flatnonzero(sizes >= _FEWEST):
+        inside, weights = np.flatnonzero(part == k), np.ones(sizes[k])
+        for _ in range(_REFITS):
+            motions = tracks.motions(inside, first, weights=weights)
+            deviation = _deviation(tracks, motions, inside)
+            weights = (1 - _doubt(deviation, max(_WIDE_PAIR * np.median(deviation), 1e-12))) ** 2
+        beside = np.flatnonzero((near == k).any(1))
+        shown, back = tracks.shown[:, beside], (tracks.places[:, beside] - motions[:, None, :, 3]) @ motions[:, :, :3]
+        rest, cost = _most_frequent(back, shown, reach)
+        better = cost < least[beside]
+        least[beside[better]], rest = cost[better], rest[better]
+        away[:, beside[better]] = shown[:, better] * np.linalg.norm(back[:, better] - rest, axis=-1)
+        home[:, beside[better]] = np.einsum("fij,nj->fni", motions[:, :, :3], rest) + motions[:, None, :, 3]
+    return home, away
+
+
+def _most_frequent(places: np.ndarray, shown: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where each of n points is in most frames, f64 (n,3), of its places (F,n,3) in those that show it (F,n).
+
+    And how far it is from there, f64 (n): a mean over frames of distances, none counted as more than `reach`.
+    """
+    rest, cost = places[0].copy(), np.full(places.shape[1], np.inf)
+    for f in np.unique(np.linspace(0, len(places) - 1, min(len(places), _CANDIDATES)).round().astype(int)):
+        gaps = np.linalg.norm(places - places[f], axis=-1).clip(max=reach)
+        mean = np.where(shown[f], (shown * gaps).sum(0) / shown.sum(0), np.inf)
+        better = mean < cost
+        cost[better] = mean[better]
+        near = shown * (gaps < reach)
+        rest[better] = ((near[..., None] * places).sum(0) / near.sum(0).clip(1)[:, None])[better]
+    return rest, cost
 
 
 def fit_motions(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:

@@ -198,10 +198,11 @@ class Trainer:
             self.flows.put(pair.number, both)
 
     def _measure_flow_error(self, flow: torch.Tensor, loaded: list[LoadedPair]) -> None:
-        """Notes for the log how far the flow in use is from the true one, where the data know that."""
-        if all(pair.flow is not None for pair in loaded):
+        """Notes for the log how far the flow in use is from the true one, at the points where the data know that."""
+        known = torch.from_numpy(np.stack([pair.known for pair in loaded]))
+        if all(pair.flow is not None for pair in loaded) and known.any():
             truth = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
-            self._count({"flow_error": float((flow - truth).norm(dim=-1).mean())})
+            self._count({"flow_error": float((flow - truth).norm(dim=-1)[known].mean())})
 
     def _count(self, values: dict[str, float]) -> None:
         """Adds values to the epoch's means."""

@@ -14,6 +14,7 @@ from dpcli.errors import DataError
 from dpcli.segment.commands import joints as command
 from dpcli.segment.commands.joints import find_joints
 from dpcli.segment.kinematics.part_surfaces import part_surface
+from dpcli.segment.rigid_motions import move
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 from tests.support.commands import exit_code, piped
@@ -284,6 +285,34 @@ def test_a_turn_that_points_do_not_show_is_told(turn, said, tmp_path, capsys):
     find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
     assert json.loads((tmp_path / "j.json").read_text())[0]["joints"][0]["type"] == "fixed"
     assert capsys.readouterr().err.count("called fixed") == said
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_motion_that_is_no_hinge_is_not_called_one_in_silence(straight, tmp_path, capsys):
+    """A small block turns on a plate while its middle goes straight, or, as a hinge lets it, around a corner of the plate."""
+    rng, frames, motions = np.random.default_rng(1), [], []
+    for t in range(6):
+        angle, motion = 0.3 * t, np.eye(4)
+        motion[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        if straight:
+            motion[:2, 3] = [0.16 * t, 0.1 * t]
+        else:
+            motion[:2, 3] = ((np.eye(4) - motion) @ [0.6, -0.5, 0, 0])[:2]
+        plate = rng.uniform(-1, 1, (900, 3)) * [1, 0.7, 0.05]
+        block = rng.uniform(-0.5, 0.5, (160, 3)) * [0.5, 0.25, 0.2]
+        axis = rng.integers(0, 3, 160)
+        block[np.arange(160), axis] = np.sign(block[np.arange(160), axis]) * np.array([0.25, 0.125, 0.1])[axis]
+        frames.append(np.float32(np.concatenate([plate, move(motion, block + [0, 0, 0.15])])))
+        motions.append(motion)
+    cloud = CloudSequence.from_frames("puck", frames, part=[np.repeat([0, 1], [900, 160])] * 6)
+    steps = np.stack([np.stack([np.eye(4), motions[t + 1] @ np.linalg.inv(motions[t])]) for t in range(5)])
+    with PartsWriter(tmp_path / "p.h5", num_parts=2, class_names=[], length_unit="m") as writer:
+        share, flow = np.eye(2, dtype=np.float32)[cloud.part], [np.zeros((1060, 3), np.float32)] * 5
+        writer.write(cloud, share, np.array([(t, t + 1) for t in range(5)]), steps, flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
+    kind = json.loads((tmp_path / "j.json").read_text())[0]["joints"][0]["type"]
+    told = "the joint may be free: part 1 on part 0 of puck" in capsys.readouterr().err
+    assert (kind == "free" or told) if straight else (kind == "revolute" and not told)
 
 
 def test_one_frame_has_no_joints(tmp_path):
