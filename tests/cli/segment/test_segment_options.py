@@ -11,6 +11,7 @@ import typer
 from dpcli.cli.segment.app import ROOM
 from dpcli.cli.segment.profile import render_cost
 from dpcli.errors import DataError
+from dpcli.runtime.settings.value_types import words_of, write_text
 from dpcli.segment import prediction_settings
 from dpcli.segment.flow import config as flow_settings
 from dpcli.segment.network.config import NETWORK_PRESETS, PartConfig, compact, release
@@ -71,6 +72,37 @@ def test_wrong_settings_end_with_a_sentence(words, sentence, tmp_path, capsys):
     data = ["none.h5", "-o", str(tmp_path / "out")] if words[0] != "profile" else []
     assert exit_code("segment", *words, *data) == 2
     assert sentence in " ".join(capsys.readouterr().err.split()) and not (tmp_path / "out").exists()
+
+
+METHODS = prediction_settings.CATALOG.settings["method"]
+
+
+@pytest.mark.parametrize(
+    ("name", "readers"),
+    [
+        ("points", "multibody network dbscan ward ssc trajaffn"),
+        ("normalize", "multibody network dbscan ward ssc trajaffn"),
+        ("icp", "network dbscan ward ssc trajaffn"),
+        ("vote", "network dbscan ward ssc trajaffn"),
+        ("smallest", "network dbscan ward ssc trajaffn"),
+        ("split_bodies", "network"),
+        ("border", "multibody"),
+        ("flexible", "multibody"),
+        ("travel", "scene"),
+        ("most_objects", "scene"),
+        ("pairs", "multibody scene network dbscan ward ssc trajaffn"),
+    ],
+)
+def test_predict_refuses_a_setting_that_its_method_does_not_read(name, readers, tmp_path, capsys):
+    value = prediction_settings.CATALOG.settings[name].default
+    for method in words_of(METHODS.hint):
+        given = ("--method", method, "--set", f"{name}={write_text(value)}")
+        code = exit_code("segment", "predict", tmp_path / "none.h5", "-o", tmp_path / "out.h5", *given)
+        said = " ".join(capsys.readouterr().err.split())
+        if method in readers.split():
+            assert code == 3 and "none.h5" in said
+        else:
+            assert code == 2 and f"{name} belongs to --method" in said and f"{method} doesn't read it" in said
 
 
 def test_settings_of_a_preset_survive_their_file(tmp_path):
