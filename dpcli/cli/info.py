@@ -14,6 +14,7 @@ from dpcli.cli.options import Json, Picture
 from dpcli.errors import DataError, UsageError
 from dpcli.standard_streams import printable, rich_console
 
+_SAMPLES, _FRAMES = 8, 8
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
 
 
@@ -28,8 +29,8 @@ def info(
     picture: Picture = None,
     samples: Annotated[
         int, typer.Option("--samples", min=1, max=100, help="Rows of the picture; sequences on the page.")
-    ] = 8,
-    frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = 8,
+    ] = _SAMPLES,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = _FRAMES,
     view: Annotated[
         str | None,
         typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
@@ -57,8 +58,13 @@ def info(
 
     if sequence and page is None:
         raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
-    if view is not None and picture is None and page is None:
-        raise UsageError("--view turns what --picture and --page show; give one of them, too")
+    if picture is None and page is None and (samples != _SAMPLES or view is not None):
+        option = "--view" if samples == _SAMPLES else "--samples"
+        raise UsageError(
+            f"{option} is of what --picture or --page shows; give --picture FILE.png or --page FILE.html, too"
+        )
+    if picture is None and frames != _FRAMES:
+        raise UsageError("--frames chooses the columns of --picture; give --picture FILE.png, too")
     model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
     if model is not None and model.suffix == SUFFIX:
         if picture is not None:

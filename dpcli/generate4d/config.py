@@ -227,3 +227,26 @@ def resolve_settings(given: Given) -> tuple[FitConfig, Supervision]:
         base["fit"] = replace(base["fit"], gaussians=min(base["fit"].gaussians, values["most_gaussians"]))
     resolved = CATALOG.resolve(base, given)
     return resolved["fit"], resolved["supervision"]
+
+
+def unread_settings(given: Given, config: FitConfig, supervision: Supervision) -> list[str]:
+    """Returns a sentence for each switch beside which nothing reads some of the settings that a user gave and changed."""
+    prior = supervision.prior
+    unread = (
+        (f"start = {config.start}", config.start != "sphere", ("start_radius",)),
+        ("rigid or temporal = false", not (config.rigid and config.temporal), ("temporal_weight",)),
+        ("rigid or spatial = false", not (config.rigid and config.spatial), ("spatial_weight",)),
+        (
+            "sparse = false",
+            not config.sparse,
+            ("control_points", "neighbors", "control", "rate_control", "rate_radius"),
+        ),
+        ("regularize = false", not supervision.regularize, ("thickness", "aspect")),
+        (f"prior = {prior}", prior in ("none", "views", "zero123"), ("shape", "shape_until", "shape_size")),
+        (f"prior = {prior}", prior != "views", ("views",)),
+        (f"prior = {prior}", prior != "zero123", ("augmentation",)),
+    )
+    preset = PRESETS[given.preset or "quick"]["fit"]
+    changed = {name for name in given.values if getattr(config, name, None) != getattr(preset, name, None)}
+    found = ((why, [name for name in names if name in changed]) for why, holds, names in unread if holds)
+    return [f"{', '.join(names)}: not read with {why}" for why, names in found if names]

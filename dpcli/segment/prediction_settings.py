@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
-from dpcli.segment.baselines.settings import ClassicalSettings
+from dpcli.runtime.settings.fields import check, setting, settings_of
+from dpcli.segment.baselines.settings import METHODS, ClassicalSettings
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.config import Precision
 from dpcli.segment.scene.settings import SceneSettings
@@ -62,7 +64,28 @@ class PredictSettings(NamedTuple):
     multibody: MultibodySettings = MultibodySettings()
     scene: SceneSettings = SceneSettings()
 
+    def refuse_unread(self, names: Iterable[str]) -> None:
+        """Raises UsageError for a setting among those given, by public name, that the chosen method doesn't read.
 
+        Which classical method reads which of their own settings is checked by `ClassicalSettings`.
+        """
+        method = self.classical.method
+        for name in names:
+            owners = _OWNERS.get(name, (method,))
+            if method not in owners:
+                raise UsageError(
+                    f"{name} belongs to --method {' or '.join(owners)}; {method} doesn't read it, leave it out"
+                )
+
+
+_BY_FRAMES = ("network", *METHODS)
+_OWNERS = {  # settings that only some methods read -> which
+    **{one.name: ("multibody",) for one in settings_of(MultibodySettings)},
+    **{one.name: ("scene",) for one in settings_of(SceneSettings)},
+    **dict.fromkeys(("points", "normalize"), ("multibody", *_BY_FRAMES)),
+    **dict.fromkeys(("icp", "vote", "smallest"), _BY_FRAMES),
+    "split_bodies": ("network",),
+}
 CATALOG = Catalog(
     input=InputSettings,
     classical=ClassicalSettings,

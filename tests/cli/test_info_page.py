@@ -192,6 +192,9 @@ def test_a_sequence_is_chosen_by_name_or_number(tmp_path, dpc_here):
         (("--page", tmp_path / "x.html", "--sequence", "secnd"), b"such as 'second', or a number from 0 to 1"),
         (("--page", tmp_path / "x.html", "--sequence", "2"), b"no such sequence"),
         (("--sequence", "second"), b"give --page FILE.html, too"),
+        (("--samples", "3"), b"--samples is of what --picture or --page shows"),
+        (("--view", "xyz"), b"--view is of what --picture or --page shows"),
+        (("--page", tmp_path / "x.html", "--frames", "3"), b"--frames chooses the columns of --picture"),
     ):
         refused = dpc_here("info", source, *words)
         assert refused.returncode == 2 and sentence in refused.stderr

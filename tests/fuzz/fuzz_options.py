@@ -51,6 +51,7 @@ prepare synthetic gestures -o gestures.h5 --videos-per-class 2 --subjects 2 --fr
 prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
 classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
+classify predict gestures.h5 --model model -o others.h5 --clips-per-video 1 --seed 1
 segment predict objects.h5 -o parts.h5 --fast --flow nearest --split all
 generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --set dense_steps=1 --set sparse_steps=1
 """
@@ -83,7 +84,7 @@ evaluate segmentation parts.h5 --truth objects.h5
 evaluate motion parts.h5 --truth objects.h5
 evaluate video scene.h5 --truth views.h5
 evaluate compare scores.h5 scores.h5
-evaluate runs scores.h5 scores.h5
+evaluate runs scores.h5 others.h5
 """
 
 

@@ -9,7 +9,15 @@ from dataclasses import asdict
 import pytest
 
 from dpcli.errors import UsageError
-from dpcli.generate4d.config import CATALOG, FIT_PRESETS, PRESETS, FitConfig, Supervision, resolve_settings
+from dpcli.generate4d.config import (
+    CATALOG,
+    FIT_PRESETS,
+    PRESETS,
+    FitConfig,
+    Supervision,
+    resolve_settings,
+    unread_settings,
+)
 from dpcli.runtime.settings.catalog import Given
 
 
@@ -30,6 +38,27 @@ def test_a_limit_on_gaussians_holds_from_the_start():
     assert resolve("most_gaussians=9000").gaussians == 6000
     with pytest.raises(UsageError, match="most_gaussians = 800: expected at least the 900"):
         resolve("most_gaussians=800", "gaussians=900")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("start_radius=0.3", ["start_radius: not read with start = auto"]),
+        ("start_radius=0.3 start=sphere", []),
+        ("temporal=false temporal_weight=3", ["temporal_weight: not read with rigid or temporal = false"]),
+        ("rigid=false spatial_weight=3 spatial_radius=0.2", ["spatial_weight: not read with rigid or spatial = false"]),
+        ("sparse=false control_points=9 arap=1", ["control_points: not read with sparse = false"]),
+        ("regularize=false aspect=3 thickness=1", ["aspect, thickness: not read with regularize = false"]),
+        ("prior=none shape_until=0.5", ["shape_until: not read with prior = none"]),
+        ("prior=inflated shape_until=0.5 views=2", ["views: not read with prior = inflated"]),
+        ("prior=views views=2 augmentation=2", ["augmentation: not read with prior = views"]),
+        ("sparse=false neighbors=8", []),  # as in the preset
+    ],
+)
+def test_what_nothing_reads_is_told(words, says):
+    given = Given("quick", sets=CATALOG.parse_set(words.split()))
+    found = unread_settings(given, *resolve_settings(given))
+    assert [", ".join(sorted(line.split(": ")[0].split(", "))) + line[line.index(":") :] for line in found] == says
 
 
 @pytest.mark.parametrize(

@@ -79,15 +79,15 @@ def video(
 ) -> None:
     """Evaluate a video or a 4D scene: PSNR, SSIM, LPIPS, CLIP, FVD, warping error, and a scene's parts, tracks and surface."""
     from dpcli.evaluate.commands.video import run_video
-    from dpcli.evaluate.video.protocol import video_protocol
+    from dpcli.evaluate.video.protocol import check_choices_of, video_protocol
 
+    asked, networks = parse_video_metrics(metrics), {"lpips": choices.lpips, "fvd": choices.fvd, "every": choices.every}
+    check_choices_of(asked, choices.background, **networks)
     result = run_video(
         predicted,
         truth,
-        metrics=parse_video_metrics(metrics),
-        protocol=video_protocol(
-            choices.protocol, choices.background, lpips=choices.lpips, fvd=choices.fvd, every=choices.every
-        ),
+        metrics=asked,
+        protocol=video_protocol(choices.protocol, choices.background, **networks),
         intersect=intersect,
         weights=weights,
         device=device,

@@ -42,9 +42,12 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit a 4D scene to the pictures of each views file. Running again continues; SIGTERM saves first (exit 75)."""
-    from dpcli.generate4d.config import resolve_settings
+    from dpcli.generate4d.config import resolve_settings, unread_settings
+    from dpcli.runtime.progress import log
 
     config, supervision = resolve_settings(given)
+    for line in unread_settings(given, config, supervision):
+        log.warn(line)
     many = len(views) > 1 or output.endswith("/") or Path(output).is_dir()
     if many:
         if run is not None or picture is not None:

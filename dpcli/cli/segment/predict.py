@@ -55,9 +55,9 @@ def predict(
     force: Force = False,
 ) -> None:
     """Find the part of every point, consistent over all frames, each part's rigid motion, and the flow between frames."""
-    settings = PredictSettings(
-        **CATALOG.resolve(PredictSettings()._asdict(), _choose_method(given, model, fast, scene))
-    )
+    chosen = _choose_method(given, model, fast, scene)
+    settings = PredictSettings(**CATALOG.resolve(PredictSettings()._asdict(), chosen))
+    settings.refuse_unread(chosen.values)
     from dpcli.segment.commands.predict import Drawings, predict_file, told_of_scenes
 
     drawings = Drawings(picture, turntable, ply)

@@ -19,6 +19,7 @@ def train(
 ) -> None:
     """Train a part network on pairs of frames; no labels are read unless --supervised. Running again continues."""
     settings = TrainSettings(**CATALOG.resolve(PRESETS[str(given.preset)], given))
+    settings.refuse_unread()
     from dpcli.segment.commands.train import train_part_network
 
     typer.echo(train_part_network(data, output, settings, seed=seed, device=device, force=force))

@@ -61,6 +61,8 @@ def measure_file(path: Path, source: str, options: EvaluationOptions) -> list[Fi
     if kind == "video":
         return [_measure_video(path, source, options)]
     names = options.metrics or (*SEGMENTATION_METRICS, *(MOTION_METRICS if _has_motion(path, options.truth) else ()))
+    if options.ignore_below and not set(names) & set(SEGMENTATION_METRICS):
+        raise UsageError(f"{source}: --ignore-below is of {', '.join(SEGMENTATION_METRICS)}, and --metrics names none")
     tasks = ((_measure_segmentation, SEGMENTATION_METRICS), (_measure_motion, MOTION_METRICS))
     return [
         measure(path, source, options, asked)

@@ -57,14 +57,19 @@ def collect(
 ) -> Collected:
     """Returns the results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
 
-    truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
+    truth: of the parts files that are named without one. pictures: also what needs the files behind a
     result (clouds, strips). Equal objects count once. Raises DataError for a file that holds no result, UsageError for no
-    arguments or a pipe named twice.
+    arguments, a pipe named twice, or a truth that no file is compared with.
     """
     if not arguments:
         raise UsageError("no results to report; " + _EXPECTED)
     if list(arguments).count("-") > 1:
         raise UsageError("- names the pipe, which can be read only once")
+    if truth is not None and not any(map(_takes_truth, arguments)):
+        raise UsageError(
+            f"--truth {truth}: is of parts files, and none is given without a truth of its own; of scores and videos name both"
+            " as FILE=TRUTH"
+        )
     results = [result for argument in arguments for result in _results_of(argument, truth, split, pictures, stdin)]
     return _drop_repeats(results)
 
@@ -89,6 +94,12 @@ def _results_of(
     if kind == "statistics":
         raise DataError(f"{path}: {KEPT_STATISTICS}")
     raise DataError(f"{path}: holds {kind!r}, which has no result in it; {_EXPECTED}")
+
+
+def _takes_truth(argument: str) -> bool:
+    """Returns whether that names a parts file alone, which is compared with the truth of all."""
+    path, own = _split_pair(argument)
+    return own is None and path.is_file() and is_hdf5(path) and file_kind(path) == "parts"
 
 
 def _split_pair(argument: str) -> tuple[Path, Path | None]:

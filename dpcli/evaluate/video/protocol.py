@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.choices import BACKGROUNDS, FVD_VARIANTS, LPIPS_NETWORKS, PICTURE_METRICS
+from dpcli.evaluate.choices import (
+    BACKGROUNDS,
+    FRECHET_METRICS,
+    FVD_VARIANTS,
+    LPIPS_NETWORKS,
+    PICTURE_METRICS,
+    SCENE_METRICS,
+)
 from dpcli.evaluate.video.picture_statistics import PSNR_CAP, PictureStatistics, picture_update
 from dpcli.evaluate.video.sources.source import Picture
 
@@ -103,6 +110,22 @@ def check_picture_of(metrics: Sequence[str] | None, picture: object) -> None:
     """Raises UsageError when a picture is asked for, but only metrics that compare none."""
     if picture is not None and metrics is not None and not set(metrics) & set(PICTURE_METRICS):
         raise UsageError(f"--picture shows pictures: ask for one of {','.join(PICTURE_METRICS)}, or leave it out")
+
+
+def check_choices_of(
+    metrics: Sequence[str] | None, background: str | None, *, lpips: str | None, fvd: str | None, every: int
+) -> None:
+    """Raises UsageError for a choice, as in `video_protocol`, that none of the metrics depends on; None: the default ones."""
+    asked = set(metrics or PICTURE_METRICS)
+    for option, given, readers in (
+        ("--lpips", lpips is not None, ("lpips",)),
+        ("--fvd", fvd is not None, ("fvd",)),
+        ("--every", every != 1, FRECHET_METRICS),
+    ):
+        if given and not asked & set(readers):
+            raise UsageError(f"{option} is of {', '.join(readers)}: name it in --metrics, too, or leave {option} out")
+    if background is not None and asked <= set(SCENE_METRICS):
+        raise UsageError(f"--background {background}: {', '.join(sorted(asked))} compare no pictures; leave it out")
 
 
 def comparable(picture: Picture, protocol: VideoProtocol) -> np.ndarray:

@@ -24,6 +24,7 @@ from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.baselines.settings import ClassicalSettings
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
+from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.model_file import default_model
 from dpcli.segment.prediction import pairs_to_report, predict_parts
 from dpcli.segment.prediction_settings import PredictSettings, Refinement
@@ -187,7 +188,20 @@ def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
         raise UsageError(
             f"--flow {flow}: {method} finds the motions itself; add --method network or a classical one, or leave it out"
         )
+    if method == "multibody":
+        _check_multibody(settings.multibody, reader, flow in ("auto", "tracks") and "track" in reader.fields)
     return "icp" if flow in ("auto", "tracks") else flow
+
+
+def _check_multibody(settings: MultibodySettings, reader: CloudsReader, by_tracks: bool) -> None:
+    """Raises UsageError for a setting of tracks where none are used; warns of those of the search where tracks are."""
+    changed = [name for name, value in asdict(settings).items() if value != getattr(MultibodySettings, name)]
+    if "flexible" in changed and not by_tracks:
+        why = "--flow icp uses none" if "track" in reader.fields else f"{reader.path} has no field track"
+        raise UsageError(f"flexible = {settings.flexible:g}: it belongs to tracks, and {why}; leave it out")
+    unread = [name for name in changed if name not in ("flexible", "most_bodies")]
+    if by_tracks and unread:
+        log.warn(f"{', '.join(unread)}: not read where points have tracks; --flow icp searches by places instead")
 
 
 def _predict_sequences(

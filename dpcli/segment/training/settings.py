@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import check, setting, settings_of
 from dpcli.segment.network.config import NETWORK_PRESETS, NetworkSettings, Precision
 
 
@@ -100,6 +101,30 @@ class TrainSettings(NamedTuple):
     schedule: Schedule = Schedule()
     objective: Objective = Objective()
 
+    def refuse_unread(self) -> None:
+        """Raises UsageError for settings that were changed, but that nothing reads beside the others that were chosen."""
+        objective, motion_head = self.objective, self.network.motion_head
+        unread = (
+            ("supervised = true", objective.supervised, _WITHOUT_LABELS),
+            ("motion_head = false", not motion_head, ("motion", "motion_after")),
+            ("no consensus", not motion_head or objective.consensus == "none", ("tau", "consensus_after")),
+            ("cold_start = 0", not objective.cold_start, ("cold_until",)),
+            ("flow_decay = 1", objective.flow_decay == 1, ("update_after",)),
+        )
+        changed = {
+            one.name
+            for group in (self.run, objective)
+            for one in settings_of(type(group))
+            if getattr(group, one.field) != one.default
+        }
+        for why, holds, names in unread:
+            if wrong := [name for name in names if holds and name in changed]:
+                raise UsageError(f"{', '.join(wrong)}: not read with {why}; leave out one or the other")
 
+
+_WITHOUT_LABELS = (
+    *("flow", "flows_of", "loss", "dynamic", "smooth", "smooth_after", "invariance", "cold_start", "cold_until"),
+    *("consensus", "consensus_after", "tau", "flow_decay", "update_after", "motion_after"),
+)
 CATALOG = Catalog(network=NetworkSettings, run=RunSettings, precision=Precision, schedule=Schedule, objective=Objective)
 PRESETS = {name: TrainSettings(network)._asdict() for name, network in NETWORK_PRESETS.items()}

@@ -14,6 +14,7 @@ from dpcli.cli.evaluate import app as evaluate
 from dpcli.cli.evaluate.options import word_option
 from dpcli.cli.option_groups import with_option_groups
 from dpcli.errors import UsageError
+from tests.support.commands import exit_code
 
 
 @dataclass(frozen=True)
@@ -82,3 +83,27 @@ def test_every_option_is_described_in_a_whole_phrase() -> None:
             (info,) = [own for own in one.annotation.__metadata__ if hasattr(own, "help")]
             assert info.help and len(info.help.split()) > 1, (command.callback.__name__, name)
             assert info.help[0].isupper() or info.help.startswith(("psnr", "auto")), (command.callback.__name__, name)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--lpips vgg", "--lpips is of lpips: name it in --metrics, too"),
+        ("--lpips vgg --metrics psnr,clip", "--lpips is of lpips"),
+        ("--fvd videogpt --metrics lpips", "--fvd is of fvd"),
+        ("--every 3 --metrics lpips", "--every is of fvd, fid_vid_r3d50, fid_vid_inception"),
+        ("--background black --metrics parts,tracks", "--background black: parts, tracks compare no pictures"),
+    ],
+)
+def test_a_choice_of_a_video_that_no_metric_depends_on_is_refused(words, sentence, tmp_path, capsys) -> None:
+    files = ("none.h5", "--truth", "none.h5")
+    assert exit_code("evaluate", "video", *files, *words.split()) == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    "words", ["--lpips vgg --metrics lpips", "--every 3 --metrics fid_vid_r3d50", "--background black"]
+)
+def test_a_choice_of_a_video_that_a_metric_depends_on_is_taken(words, tmp_path, capsys) -> None:
+    assert exit_code("evaluate", "video", tmp_path / "none.h5", "--truth", tmp_path / "none.h5", *words.split()) == 3
+    assert "none.h5" in capsys.readouterr().err

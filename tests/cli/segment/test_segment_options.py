@@ -11,6 +11,7 @@ import typer
 from dpcli.cli.segment.app import ROOM
 from dpcli.cli.segment.profile import render_cost
 from dpcli.errors import DataError
+from dpcli.runtime.settings.value_types import words_of, write_text
 from dpcli.segment import prediction_settings
 from dpcli.segment.flow import config as flow_settings
 from dpcli.segment.network.config import NETWORK_PRESETS, PartConfig, compact, release
@@ -59,6 +60,14 @@ def test_the_room_and_help_load_no_torch():
     [
         (("train", "--set", "flow_decy=1"), "unknown setting flow_decy; did you mean flow_decay?"),
         (("train", "--set", "epochs=1", "--epochs", "2"), "epochs is given twice, by --epochs and by --set"),
+        (("train", "--supervised", "--flow", "nearest"), "flow: not read with supervised = true"),
+        (("train", "--supervised", "--set", "flow_decay=1"), "flow_decay: not read with supervised = true"),
+        (("train", "--supervised", "--set", "loss=per-part"), "loss: not read with supervised = true"),
+        (("train", "--set", "motion_head=false", "--set", "motion=1"), "motion: not read with motion_head = false"),
+        (("train", "--set", "motion_head=false", "--set", "tau=1"), "tau: not read with no consensus"),
+        (("train", "--set", "consensus=none", "--set", "tau=1"), "tau: not read with no consensus"),
+        (("train", "--set", "cold_start=0", "--set", "cold_until=0.5"), "cold_until: not read with cold_start = 0"),
+        (("train", "--set", "flow_decay=1", "--set", "update_after=0"), "update_after: not read with flow_decay = 1"),
         (("flow", "--steps", "0"), "steps = 0: expected at least 1"),
         (("flow", "--set", "norm=none"), "norm = none: expected one of layer, batch"),
         (("predict", "--set", "vote"), "--set vote: expected NAME=VALUE, such as --set vote=true"),
@@ -71,6 +80,37 @@ def test_wrong_settings_end_with_a_sentence(words, sentence, tmp_path, capsys):
     data = ["none.h5", "-o", str(tmp_path / "out")] if words[0] != "profile" else []
     assert exit_code("segment", *words, *data) == 2
     assert sentence in " ".join(capsys.readouterr().err.split()) and not (tmp_path / "out").exists()
+
+
+METHODS = prediction_settings.CATALOG.settings["method"]
+
+
+@pytest.mark.parametrize(
+    ("name", "readers"),
+    [
+        ("points", "multibody network dbscan ward ssc trajaffn"),
+        ("normalize", "multibody network dbscan ward ssc trajaffn"),
+        ("icp", "network dbscan ward ssc trajaffn"),
+        ("vote", "network dbscan ward ssc trajaffn"),
+        ("smallest", "network dbscan ward ssc trajaffn"),
+        ("split_bodies", "network"),
+        ("border", "multibody"),
+        ("flexible", "multibody"),
+        ("travel", "scene"),
+        ("most_objects", "scene"),
+        ("pairs", "multibody scene network dbscan ward ssc trajaffn"),
+    ],
+)
+def test_predict_refuses_a_setting_that_its_method_does_not_read(name, readers, tmp_path, capsys):
+    value = prediction_settings.CATALOG.settings[name].default
+    for method in words_of(METHODS.hint):
+        given = ("--method", method, "--set", f"{name}={write_text(value)}")
+        code = exit_code("segment", "predict", tmp_path / "none.h5", "-o", tmp_path / "out.h5", *given)
+        said = " ".join(capsys.readouterr().err.split())
+        if method in readers.split():
+            assert code == 3 and "none.h5" in said
+        else:
+            assert code == 2 and f"{name} belongs to --method" in said and f"{method} doesn't read it" in said
 
 
 def test_settings_of_a_preset_survive_their_file(tmp_path):

@@ -263,6 +263,8 @@ def test_what_cannot_be_compared(run, scores, parts, tmp_path):
         run("compare", parts["truth"], parts["truth"])
     with pytest.raises(UsageError, match="--protocol and --ignore-below are for parts"):
         run("compare", scores["good"], scores["good"], "--ignore-below", 3)
+    with pytest.raises(UsageError, match="--ignore-below is of ap, .*, and --metrics names none"):
+        run("compare", parts["good"], parts["pairs"], *truth, "--metrics", "epe3d", "--ignore-below", 3)
 
 
 def test_rounding_is_no_difference(run, parts, tmp_path):

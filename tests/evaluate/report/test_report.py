@@ -252,7 +252,9 @@ def test_what_is_no_result_is_said(tmp_path, content, words):
     assert str(path) in str(caught.value)
 
 
-def test_what_is_missing_is_said(parts, truth, tmp_path):
+def test_what_is_missing_is_said(parts, scores, truth, tmp_path):
+    with pytest.raises(UsageError, match="is of parts files, and none is given without a truth of its own"):
+        collect([str(scores), f"{parts}={truth}"], truth)
     with pytest.raises(UsageError, match="no results to report"):
         collect([])
     with pytest.raises(UsageError, match="add --truth"):

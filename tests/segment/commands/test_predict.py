@@ -185,3 +185,23 @@ def test_resolved_settings_stand_in_the_file(dpc_here, data, tmp_path):
     assert "eps" not in config["classical"]
     told = dpc_here("info", tmp_path / "p.h5").stdout.decode()
     assert "settings refinement  icp 20, normalize true, pairs adjacent, points 48" in told
+
+
+def test_settings_of_tracks_and_of_the_search_are_told_apart(dpc_here, tmp_path):
+    """`flexible` is read only by tracks, the search's settings only without them."""
+    rng = np.random.default_rng(2)
+    clouds = [np.float32(rng.uniform(-1, 1, (60, 3)))] * 2
+    for fields in ([], ["track"]):
+        with CloudsWriter(tmp_path / f"c{len(fields)}.h5", fields=fields) as writer:
+            sequence = CloudSequence.from_frames("one", clouds)
+            sequence.track = np.tile(np.arange(60), 2) if fields else None
+            writer.write(sequence)
+    predict = ("segment", "predict")
+    done = dpc_here(*predict, tmp_path / "c0.h5", "-o", tmp_path / "p.h5", "--set", "flexible=0.1")
+    assert done.returncode == 2 and b"c0.h5 has no field track" in done.stderr
+    words = ("--set", "flexible=0.1", "--flow", "icp")
+    done = dpc_here(*predict, tmp_path / "c1.h5", "-o", tmp_path / "p.h5", *words)
+    assert done.returncode == 2 and b"--flow icp uses none" in done.stderr
+    words = ("--set", "flexible=0.1", "--set", "border=0.1", "--set", "most_bodies=3")
+    done = dpc_here(*predict, tmp_path / "c1.h5", "-o", tmp_path / "p.h5", *words)
+    assert done.returncode == 0 and b"warning: border: not read where points have tracks" in done.stderr
