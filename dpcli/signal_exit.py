@@ -18,10 +18,8 @@ if TYPE_CHECKING:  # as in typing, whose import would take longer than all of th
 STOPPED, INTERRUPTED = 75, 130  # as EX_TEMPFAIL, and as a shell reports SIGINT
 _RETRY = 0.05  # seconds until it is looked again whether an import still runs
 _AGAIN = 1.0  # seconds until it is looked whether the command is ending or a library dropped what should end it
-_GRACE, _SECOND_GRACE = (
-    15,
-    2,
-)  # seconds after which a first, a second signal that Python didn't acknowledge ends the process
+# seconds after which a first, a second signal that Python didn't acknowledge ends the process
+_GRACE, _SECOND_GRACE = (15, 2)
 _ACKNOWLEDGED = b"\0"  # no signal's number
 _OVERTAKEN = 0.1  # seconds in which the number of a signal that another thread got may come after the answer to it
 STOP_NAMES = ("SIGTERM", "SIGUSR1", "SIGUSR2", "SIGHUP")  # sent by batch systems before they kill; by a closed terminal

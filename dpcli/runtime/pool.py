@@ -154,9 +154,8 @@ class _Pool:
             self._end_broken()
             self._open()
             future = _submitted(self._executor, self._without, self._work, item)
-        self._children |= (
-            set(multiprocessing.active_children()) - self._strangers
-        )  # now: later it forgets those that ended
+        # now: later it forgets those that ended
+        self._children |= set(multiprocessing.active_children()) - self._strangers
         return future
 
     def result(self, item: Any, future: Future) -> Any:

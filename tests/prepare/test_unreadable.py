@@ -242,9 +242,8 @@ def test_frames_of_an_avi_without_bytes_are_counted(tmp_path):
     )
     video = read_depth_video(tmp_path / "a.avi")
     assert len(video.frames) == 8 and video.notes == {LEFT_OUT: 1} and not video.missing
-    (tmp_path / "b.avi").write_bytes(
-        data[:48] + bytes([65]) + data[49:]
-    )  # the main header promises more than the stream's
+    # the main header promises more than the stream's
+    (tmp_path / "b.avi").write_bytes(data[:48] + bytes([65]) + data[49:])
     video = read_depth_video(tmp_path / "b.avi")
     assert len(video.frames) == 9 and video.missing == 56
 

@@ -20,11 +20,8 @@ _FLAGS = (
     "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update"
     " --disable-sync --hide-scrollbars --dump-dom"
 ).split()
-_PATIENCE = (
-    30,
-    60,
-    80,
-)  # seconds, try by try; a page takes 2 to 5; on a busy machine a browser may hang while it starts
+# seconds, try by try; a page takes 2 to 5; on a busy machine a browser may hang while it starts
+_PATIENCE = (30, 60, 80)
 
 
 def open_page(address: str, folder: Path, *flags: str) -> tuple[str, str]:

@@ -21,10 +21,8 @@ from dpcli.generate4d.targets import Targets
 from dpcli.runtime.progress import log
 
 _ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
-_RAYS, _STEPS = (
-    400,
-    192,
-)  # pixels of a silhouette, and places on the ray of each, that other silhouettes are asked about
+# pixels of a silhouette, and places on the ray of each, that other silhouettes are asked about
+_RAYS, _STEPS = (400, 192)
 _SHARED = 0.95  # of a silhouette, at least, lies within all others where their cameras are right
 
 

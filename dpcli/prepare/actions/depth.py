@@ -381,9 +381,8 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     suffixes = (*VIDEO_SUFFIXES, *ARRAY_SUFFIXES)
     found += [(recording, None) for recording in find_recordings(path)]
     clips = {os.fspath(recording) for recording, _ in found}
-    for folder, folders, files in walk_folders(
-        path
-    ):  # frames are many: they are neither sorted nor asked what they are
+    # frames are many: they are neither sorted nor asked what they are
+    for folder, folders, files in walk_folders(path):
         for name in folders:
             with suppress(PermissionError):  # it is told as skipped
                 if series := frame_series(Path(folder, name), pattern):

@@ -18,10 +18,8 @@ _STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per
 _SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
 _MARKED, _WELL_BELOW = 0.005, 0.97  # share of pixels that hold a mark; up to where the others reach then
 _FAR_BELOW = 0.25  # up to where they reach where the mark is no largest number of some bits
-_WIDE, _SPARSE = (
-    3,
-    0.5,
-)  # width by height, and share of pixels with a depth, of a lidar's points drawn into a street's picture
+# width by height, and share of pixels with a depth, of a lidar's points drawn into a street's picture
+_WIDE, _SPARSE = (3, 0.5)
 LIKE_KITTI = (
     "videos of wide pictures with few depths; if they are KITTI's, 256 units are a meter: give --depth-scale 256"
 )

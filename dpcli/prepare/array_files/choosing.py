@@ -147,9 +147,8 @@ def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
                 groups.setdefault((above.rpartition("/")[0] if inside else above, inside), []).append(name)
     found = []
     for (group, inside), names in groups.items():
-        if group and _counts_frames(
-            group.rpartition("/")[2], words=1
-        ):  # clouds of one frame, such as of several sensors
+        # clouds of one frame, such as of several sensors
+        if group and _counts_frames(group.rpartition("/")[2], words=1):
             continue
         own = [name.removesuffix(f"/{inside}").rpartition("/")[2] for name in names]
         if inside and not all(map(_counts_frames, own)):

@@ -188,9 +188,8 @@ def _sizes(piece: _Piece, poses: np.ndarray) -> np.ndarray:
 def _has_twin(mesh: AnimatedMesh) -> np.ndarray:
     """Returns bool (F): which triangles lie on another one, as exporters write a leaf that is seen from both sides."""
     areas = np.stack([mesh.areas(frame) for frame in range(mesh.num_frames)])
-    shown = (areas > SHRUNK**2 * areas.max(0)).argmax(
-        0
-    )  # the first frame: while hidden, all of a piece lie on one point
+    # the first frame: while hidden, all of a piece lie on one point
+    shown = (areas > SHRUNK**2 * areas.max(0)).argmax(0)
     corners = mesh.positions[shown[:, None], mesh.triangles].astype(np.float64)
     grid = max(float(np.ptp(corners)), 1e-30) * 1e-6
     middles = np.rint(np.concatenate([corners.mean(1), corners.min(1), corners.max(1)], axis=1) / grid)

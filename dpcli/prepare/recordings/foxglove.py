@@ -16,9 +16,8 @@ import numpy as np
 from dpcli.ops.rotations import quaternion_to_matrix
 
 _NAMES = ("PointCloud", "RawImage", "CompressedImage", "CameraCalibration")
-CLOUDS, IMAGES, COMPRESSED, CAMERAS = (
-    (f"foxglove.{name}", f"foxglove_msgs/msg/{name}") for name in _NAMES
-)  # in Protobuf and JSON, and in ROS
+# in Protobuf and JSON, and in ROS
+CLOUDS, IMAGES, COMPRESSED, CAMERAS = ((f"foxglove.{name}", f"foxglove_msgs/msg/{name}") for name in _NAMES)
 FOXGLOVE_KINDS = (*CLOUDS, *IMAGES, *COMPRESSED, *CAMERAS)
 _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # NumericType -> datatype of PointField
 _VECTOR = {1: ("x", float), 2: ("y", float), 3: ("z", float)}

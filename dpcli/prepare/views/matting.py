@@ -17,11 +17,8 @@ _RIM = 2  # pixels on each side of an outline where object and background mix
 HOLES = ("auto", "keep", "cut")
 _GAP = 0.005  # of the object: what may be a gap between limbs
 _FLAT = 4.0  # gray levels that a gap may be off the background more than the background itself: noise of compression
-_SOFT, _MANY, _TOGETHER = (
-    200,
-    50,
-    0.6,
-)  # alpha below, pixels at least, and correlation above, to tell colors that fade with alpha
+# alpha below, pixels at least, and correlation above, to tell colors that fade with alpha
+_SOFT, _MANY, _TOGETHER = (200, 50, 0.6)
 _SPECK = 1e-4  # of the picture: smaller islands are noise
 
 

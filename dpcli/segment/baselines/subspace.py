@@ -71,9 +71,8 @@ def trajectory_affinity(
     from scipy.spatial.distance import cdist
 
     apart, differs = np.zeros((2, len(motion), len(motion)))
-    for points in trajectories.swapaxes(
-        0, 1
-    ):  # frame by frame: all of a long sequence's distances would fill the memory
+    # frame by frame: all of a long sequence's distances would fill the memory
+    for points in trajectories.swapaxes(0, 1):
         apart += np.sqrt(cdist(points, points, "sqeuclidean"))
     for way in motion.swapaxes(0, 1):
         np.maximum(differs, cdist(way, way, "sqeuclidean"), out=differs)

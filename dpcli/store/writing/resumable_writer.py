@@ -90,9 +90,8 @@ class ResumableWriter(ABC):
 
     def _open(self, force: bool) -> None:
         before = None
-        if (
-            self.resume and self.path.parent.is_dir() and not self.path.is_dir()
-        ):  # AtomicFile explains what is wrong otherwise
+        # AtomicFile explains what is wrong otherwise
+        if self.resume and self.path.parent.is_dir() and not self.path.is_dir():
             try:
                 before = Journal(journal_path(self.path), self._about())
             except DpcError:  # it names the journal, which nobody knows

@@ -117,9 +117,8 @@ def start(out: Path, videos: int = VIDEOS) -> subprocess.Popen:
         text=True,
         cwd=ROOT,
         start_new_session=True,
-        preexec_fn=lambda: signal.signal(
-            signal.SIGINT, signal.SIG_DFL
-        ),  # ignored where a shell put us in the background
+        # ignored where a shell put us in the background
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     while not (part.exists() and part.stat().st_size > before + 100_000):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()

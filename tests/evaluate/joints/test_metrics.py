@@ -164,10 +164,8 @@ def test_any_tree_is_measured_by_its_motions(seed):
             expected.turns.append(np.degrees(apart.magnitude()).mean())
         elif right and moves:
             expected.slides.append(np.linalg.norm(turned - shifted, axis=1).mean())
-    part, name = (
-        rng.permutation(np.repeat(np.arange(parts), 9)),
-        rng.permutation(parts),
-    )  # true part k is predicted name[k]
+    # true part k is predicted name[k]
+    part, name = (rng.permutation(np.repeat(np.arange(parts), 9)), rng.permutation(parts))
     guess = rerooted(guess, int(rng.integers(parts)))[:, np.argsort(name)]
     guess[..., PARENT] = np.where(guess[..., PARENT] < 0, -1, name[guess[..., PARENT].astype(int)])
     found = joint_statistics(part, truth, name[part], guess, lambda child, parent: child in moving)

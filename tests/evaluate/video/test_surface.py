@@ -114,8 +114,7 @@ def test_a_scene_shows_the_same_surface_wherever_it_stands():
     )
     for points in (here, there):
         assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.1
-        disk = (
-            14 * np.pi * (SIDE / 2 / 1.4) ** 2
-        )  # pixels of the ball in all pictures; its Gaussians' rim adds a tenth to its radius
+        # pixels of the ball in all pictures; its Gaussians' rim adds a tenth to its radius
+        disk = 14 * np.pi * (SIDE / 2 / 1.4) ** 2
         assert disk < len(points) < 1.25 * disk
     assert len(here) == pytest.approx(len(there), rel=1e-3)

@@ -260,9 +260,8 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
         "--background",
         "black",
     ]
-    done = CliRunner().invoke(
-        app, [*words, str(tmp_path / "q.h5"), *sheet_words]
-    )  # what a sheet has use for is its own
+    # what a sheet has use for is its own
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *sheet_words])
     assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
 
 

@@ -52,9 +52,8 @@ def test_a_ball_is_as_deep_as_it_is_wide_and_lies_about_zero():
         seen = rgba[3] > 0
         width = np.ptp(np.flatnonzero(seen.any(0))) / 48
         assert 0.82 < width < 0.94
-        assert (
-            0.84 * width < np.nanmax(depth[1] - depth[0]) < 1.02 * width
-        )  # a near camera sees the outline before the middle
+        # a near camera sees the outline before the middle
+        assert 0.84 * width < np.nanmax(depth[1] - depth[0]) < 1.02 * width
         assert np.nanmin(depth[0]) == pytest.approx(-np.nanmax(depth[1]), abs=0.04)
         assert np.array_equal(seen, ~np.isnan(depth[0])) and np.isnan(depth[2:]).all()
 

@@ -129,9 +129,8 @@ def test_standing_feet_hardly_slide(motion):
         foot = moved[:, shape.bone] @ np.append(shape.b, 1)
         speed = np.diff(foot[:, 2]) / body
         still = np.abs(speed) < 0.25
-        assert (
-            still.mean() > (0.35 if motion == "walk" else 0.25) and speed.max() > 2
-        )  # down for a good part of the cycle, then quickly forward
+        # down for a good part of the cycle, then quickly forward
+        assert still.mean() > (0.35 if motion == "walk" else 0.25) and speed.max() > 2
         assert (np.abs(speed - 1) < 0.25).mean() < 0.2  # without the body's travel it would slide all the time
 
 
@@ -152,9 +151,8 @@ def test_seeds_make_different_animals_and_the_same_again():
     one, again, other = (make_animal("walk", 2, seed=seed, cells=40) for seed in (0, 0, 1))
     assert one.positions.tobytes() == again.positions.tobytes() and one.color.tobytes() == again.color.tobytes()
     assert one.positions.shape != other.positions.shape
-    assert (
-        make_animal("wag", 2, seed=0, cells=40).color.tobytes() == one.color.tobytes()
-    )  # the same animal, another motion
+    # the same animal, another motion
+    assert make_animal("wag", 2, seed=0, cells=40).color.tobytes() == one.color.tobytes()
     for wrong in ({"motion": "hop"}, {"motion": "walk", "cycles": -1.0}):
         with pytest.raises(UsageError):
             make_animal(frames=2, **wrong)

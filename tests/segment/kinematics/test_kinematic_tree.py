@@ -191,9 +191,8 @@ def test_motions_of_many_pairs_are_averaged():
         for (i, j), step in zip(pairs, motion[:, k]):
             gaps.append((step @ found.motion[i, k] - found.motion[j, k]) @ start)
             gaps.append((np.linalg.inv(step) @ found.motion[j, k] - found.motion[i, k]) @ start)
-        assert said_apart == pytest.approx(
-            np.sqrt(np.mean([(gap**2).sum(0) for gap in gaps])), rel=0.03
-        )  # of 64 points
+        # of 64 points
+        assert said_apart == pytest.approx(np.sqrt(np.mean([(gap**2).sum(0) for gap in gaps])), rel=0.03)
         assert 0.003 < said_apart
         assert move(found.motion[2, k], start[:3].T) == pytest.approx((found.motion[2, k] @ start)[:3].T)
         assert points_at_start(sequence, k, found.motion[:, k]) == pytest.approx(start[:3].T, abs=1e-9)

@@ -407,9 +407,8 @@ def test_masks_are_shares_and_trust_a_body_that_every_frame_holds():
     found = Explanation([None, None], label, 0.0, field, field)
     masks = masks_of(found, [4, 4], 5)
     assert np.allclose(masks.sum(1), 1) and (masks.argmax(1) == label).all()
-    assert masks[0, 0] == pytest.approx(
-        2 / 3 * 1 / (1 + np.exp(-2)) + 1 / 15, rel=1e-5
-    )  # two, then three of four points
+    # two, then three of four points
+    assert masks[0, 0] == pytest.approx(2 / 3 * 1 / (1 + np.exp(-2)) + 1 / 15, rel=1e-5)
     assert masks[2, 1] < masks[0, 0]
 
 

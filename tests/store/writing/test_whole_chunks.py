@@ -39,9 +39,8 @@ def test_rows_are_where_it_says(tmp_path: Path, monkeypatch, disturbed: str, val
             placed = chunks.append(part)
             places.append(placed[1] if placed else [])
             if disturbed:
-                size = (
-                    int(rng.integers(1, 4000)) if disturbed == "by any" else rows * 3 // 2
-                )  # float64: as long as a chunk
+                # float64: as long as a chunk
+                size = int(rng.integers(1, 4000)) if disturbed == "by any" else rows * 3 // 2
                 file.create_dataset(f"other{number}", data=rng.normal(size=size))
                 file.flush()
         chunks.finish()
