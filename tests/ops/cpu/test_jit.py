@@ -114,7 +114,7 @@ def names_from(path: Path) -> set[Path]:
 
 def test_the_digest_covers_what_kernels_take_from_other_files():
     """The others named here are called by Python around the kernels."""
-    plain = {PACKAGE / "errors.py", PACKAGE / "runtime/clips/images.py", PACKAGE / "segment/flow/motion_proposals.py"}
+    plain = {PACKAGE / "errors.py", PACKAGE / "runtime/clips/images.py", PACKAGE / "segment/rigid_motions.py"}
     files = kernel_files()
     assert len(files) > 15 and set().union(*map(names_from, files)) - plain == {*jit._SHARED} - {Path(jit.__file__)}
 
