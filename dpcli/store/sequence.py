@@ -35,16 +35,19 @@ def are_lengths(values: np.ndarray) -> bool:
     return not values.size or bool(-LONGEST < values.min() and values.max() < LONGEST)
 
 
-def are_rigid(motions: np.ndarray) -> np.ndarray:
+def are_rigid(motions: np.ndarray, last_row: float = 0.0) -> np.ndarray:
     """Returns which of (...,4,4) are a rotation and a translation, last row 0 0 0 1, bool (...). NaN and infinity are not.
+
+    last_row: how far its numbers may be off, as in files of others.
 
     >>> are_rigid(np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])])).tolist()
     [True, False]
     """
     rotation = motions[..., :3, :3].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
-        square = rotation @ rotation.swapaxes(-1, -2)
-    rigid = (np.abs(square - np.eye(3)) < TOLERANCE).all((-1, -2)) & (motions[..., 3, :] == [0, 0, 0, 1]).all(-1)
+        rigid = (np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)) < TOLERANCE).all((-1, -2))
+        rigid &= (np.abs(motions[..., 3, :] - [0, 0, 0, 1]) <= last_row).all(-1)
+    rigid &= np.isfinite(motions).all((-1, -2))
     rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
     return rigid
 

@@ -15,7 +15,6 @@ from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
 _NEGLIGIBLE = 1e-3  # of the object's diameter: what moves by less doesn't move
 _LONG, _ENDLESS = 10, 1000  # diameters of the object: slides that are odd, and those that have no limits at all
 _CHECKED_STATES = 6  # values of a joint at which the place of the surface is compared
-_RIGID = 1e-3  # how far R^T R of a matrix of a file, and its last row, may be from those of a rigid motion
 
 
 @dataclass(frozen=True)
@@ -112,17 +111,6 @@ def joint_motion(joint: Joint, values: np.ndarray) -> np.ndarray:
 def transform(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Applies motions (...,4,4) to points (...,3), row by row."""
     return (motions[..., :3, :3] @ points[..., None])[..., 0] + motions[..., :3, 3]
-
-
-def are_rigid(matrices: np.ndarray) -> np.ndarray:
-    """Returns which of (...,4,4) are a rotation and a shift, bool (...); those that hold NaN or infinity are not."""
-    rotation = matrices[..., :3, :3]
-    with np.errstate(invalid="ignore", over="ignore"):
-        good = np.abs(rotation.swapaxes(-1, -2) @ rotation - np.eye(3)).max((-1, -2)) < _RIGID
-        good &= np.abs(matrices[..., 3, :] - [0, 0, 0, 1]).max(-1) < _RIGID
-    good &= np.isfinite(matrices).all((-1, -2))
-    good[good] = np.linalg.det(rotation[good]) > 0
-    return good
 
 
 def triangle_areas(triangles: np.ndarray) -> np.ndarray:

@@ -15,10 +15,10 @@ from dpcli.errors import DataError
 from dpcli.npy_files import open_archive
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
-from dpcli.prepare.articulated.articulated_object import are_rigid
 from dpcli.prepare.articulated.object_splits import counts_of_splits
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
+from dpcli.store.sequence import TOLERANCE, are_rigid
 from dpcli.text_files import read_json
 
 _MOST_PARTS = 1000  # of a sample
@@ -109,7 +109,7 @@ def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray
         raise DataError(
             f"{path}: trans[{key!r}] has shape {matrices.shape}; expected ({views}, 4, 4), one for each view"
         )
-    if not are_rigid(matrices).all():
+    if not are_rigid(matrices, TOLERANCE).all():
         raise DataError(f"{path}: trans[{key!r}] is not a rigid motion; expected a rotation and a shift")
     return matrices
 

@@ -15,9 +15,9 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names, path_inside
-from dpcli.prepare.articulated.articulated_object import are_rigid
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
+from dpcli.store.sequence import TOLERANCE, are_rigid
 
 ROOMS = 5000
 _SPLITS = {"train": "train", "val": "validation", "test": "test"}
@@ -45,7 +45,7 @@ def read_array(path: Path, kind: str, shape: tuple[int | None, ...]) -> np.ndarr
 def read_poses(path: Path) -> np.ndarray:
     """Reads pose_%02d.npy as f64 (objects,4,4). Raises DataError unless every matrix is a rotation and a shift."""
     pose = read_array(path, "f", (None, 4, 4)).astype(np.float64)
-    good = are_rigid(pose)
+    good = are_rigid(pose, TOLERANCE)
     if not good.all():
         raise DataError(
             f"{path}: the matrix of object {int(np.argmin(good)) + 1} is not a rigid motion; "
