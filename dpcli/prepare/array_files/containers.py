@@ -444,9 +444,8 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
         for one in members:
             try:
                 array = _member(path, archive.read(one))
-            except (
-                _NoNumbersError
-            ) as error:  # pictures, names or settings beside the clouds, or the clouds in another form
+            # pictures, names or settings beside the clouds, or the clouds in another form
+            except _NoNumbersError as error:
                 foreign = foreign or error
                 continue
             if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names:
