@@ -1,7 +1,7 @@
 """Random generators derived from one seed and keys, so results don't depend on order, workers or shards; all streams in one table.
 
 A stream is the first key after the seed. Within one command no two things draw from the same stream with as many keys
-behind it; where a sample's index comes first (`prepare`, `segment predict`), the streams lie beyond all indices or have
+behind it; where a sample's index comes first (`prepare`), the streams lie beyond all indices or have
 another number of keys.
 """
 
@@ -45,7 +45,8 @@ class SegmentStream(IntEnum):
     TURN = 7003  # rotation of a training batch; key: the step
     VALIDATION = 7004  # sequences for validation
     CLASSICAL = 7005  # draws of the classical methods
-    FLOW_POINTS = 7006  # points whose flow is estimated; key: the sequence
+    FLOW_POINTS = 7006  # points whose flow is estimated
+    FOUND_POINTS = 7007  # points of a frame that a method of finding parts sees; key: the frame
     FLOW_TRAINING = 7101  # training of a flow estimator; keys: 0 for its weights, 1 and the step for its pairs
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.progress import log
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, first_copies, sequence_scale, without_strays
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
@@ -45,7 +45,6 @@ class _Frames:
 
 def predict_parts(
     sequence: CloudSequence,
-    index: int,
     segmenter: FrameSegmenter | MultibodySegmenter,
     estimate: Estimate,
     options: Refinement,
@@ -53,14 +52,14 @@ def predict_parts(
 ) -> tuple[np.ndarray, PartsSample]:
     """Returns hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
 
-    index: the sequence's number, for the random draws. Frames are thinned to `points`, centered and scaled together to
+    seed: of the draws by which frames are thinned to `points`. They are centered and scaled together to
     diameter 1 (so no unit or place matters); masks are carried back to all points from the three nearest. One frame gives
     parts and no motion. Frames without points are left out of everything: their neighbors are each other's, and what
     leads from or to them stands still.
     """
     clouds = [np.float32(sequence.frame(t)) for t in range(sequence.num_frames)]
     tracks = _tracks_of(sequence) if isinstance(segmenter, MultibodySegmenter) and segmenter.by_tracks else None
-    frames = _prepare_frames(clouds, index, options, seed, tracks)
+    frames = _prepare_frames(clouds, options, seed, tracks)
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
     pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
     masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options, sequence.name)
@@ -110,9 +109,10 @@ def _tracks_of(sequence: CloudSequence) -> list[np.ndarray] | None:
 
 
 def _prepare_frames(
-    clouds: list[np.ndarray], index: int, options: Refinement, seed: int, tracks: list[np.ndarray] | None = None
+    clouds: list[np.ndarray], options: Refinement, seed: int, tracks: list[np.ndarray] | None = None
 ) -> _Frames:
-    """Returns the frames that have points, centered, scaled, and thinned by draws of the sequence's own generator.
+    """Returns the frames that have points, centered, scaled, and thinned by draws that depend on their numbers alone, so that a
+    sequence has the same parts alone and at any place in a file.
 
     With tracks, all points stay.
     """
@@ -126,7 +126,8 @@ def _prepare_frames(
         return _Frames(numbers, whole, whole, float(scale), center, [tracks[t] for t in numbers])
     known = [without_strays(cloud.numpy()) for cloud in whole]  # the nearest points tell the part of those left out
     thin = [
-        _thin(torch.from_numpy(cloud), options.points, generator(seed, index, t)) for t, cloud in zip(numbers, known)
+        _thin(torch.from_numpy(cloud), options.points, generator(seed, SegmentStream.FOUND_POINTS, t))
+        for t, cloud in zip(numbers, known)
     ]
     return _Frames(numbers, whole, thin, float(scale), center)
 

@@ -69,7 +69,7 @@ def stages() -> dict[str, Stage]:
         "network, 4 frames": lambda sequence: segmenter.segment(frames(sequence), {}),
         "object-aware ICP, 3 pairs, 20 steps": refine,
         "weighted Kabsch, 3 pairs, 8 slots": kabsch,
-        "whole prediction": lambda sequence: predict_parts(sequence, 0, segmenter, flow, Refinement(), 0)[0],
+        "whole prediction": lambda sequence: predict_parts(sequence, segmenter, flow, Refinement(), 0)[0],
     }
 
 

@@ -41,7 +41,7 @@ def to_center(first: torch.Tensor, second: torch.Tensor) -> tuple[torch.Tensor, 
 
 
 def predict(segmenter, estimate):
-    return predict_parts(sequence(), 0, segmenter, estimate, Refinement(), 0)
+    return predict_parts(sequence(), segmenter, estimate, Refinement(), 0)
 
 
 def test_flows_and_network_meet(two_threads) -> None:

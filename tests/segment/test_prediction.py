@@ -53,7 +53,7 @@ def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
     sequence.pose[:, :, :3, 3] = sequence.pose[:, :, :3, 3] * 7 + [100, -50, 3]
     scale = sequence_scale([sequence.frame(t) for t in range(3)])
     options = Refinement(pairs=pairs, icp=0, vote=False)  # where parts touch, a neighbor frame votes otherwise
-    labels, sample = predict_parts(sequence, 0, FunctionSegmenter(two_halves), true_flows(sequence, scale), options, 0)
+    labels, sample = predict_parts(sequence, FunctionSegmenter(two_halves), true_flows(sequence, scale), options, 0)
     assert rand_index(torch.tensor(labels), torch.tensor(np.int64(sequence.part))) == 1
     for (i, j), motion, flow in zip(sample.pairs, sample.motion, sample.flow):
         truth = sequence.pose[j] @ np.linalg.inv(sequence.pose[i])
@@ -85,8 +85,8 @@ def test_frames_without_points_change_nothing_for_the_others(empty, pairs):
 
     asked, same = [], []
     options = Refinement(pairs=pairs, icp=0)
-    labels, sample = predict_parts(whole, 0, FunctionSegmenter(two_halves), halves_and_flow(asked), options, 0)
-    found, holes = predict_parts(holed, 0, FunctionSegmenter(two_halves), halves_and_flow(same), options, 0)
+    labels, sample = predict_parts(whole, FunctionSegmenter(two_halves), halves_and_flow(asked), options, 0)
+    found, holes = predict_parts(holed, FunctionSegmenter(two_halves), halves_and_flow(same), options, 0)
     np.testing.assert_array_equal(found, labels)
     np.testing.assert_array_equal(holes.probability, sample.probability)
     known = {tuple(pair): number for number, pair in enumerate(sample.pairs.tolist())}
@@ -111,8 +111,8 @@ def test_copies_of_points_change_nothing(copied):
     def still(first, second):
         return torch.zeros_like(first), torch.zeros_like(second)
 
-    plain, few = predict_parts(sequence, 0, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
-    found, said = predict_parts(padded, 0, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
+    plain, few = predict_parts(sequence, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
+    found, said = predict_parts(padded, FunctionSegmenter(two_halves), still, Refinement(icp=0), 0)
     np.testing.assert_allclose(said.motion, few.motion, atol=1e-6)  # the center of the scaling may be another
     for t, frame in enumerate(frames):
         own = found[padded.frame_offsets[t] : padded.frame_offsets[t + 1]]
@@ -135,6 +135,6 @@ def test_poor_sequences_get_an_answer():
         "all equal": [np.ones((30, 3)), np.ones((40, 3))],
     }.items():
         sequence = CloudSequence.from_frames(name, [np.float32(f) for f in frames])
-        labels, sample = predict_parts(sequence, 0, FunctionSegmenter(anything), still, Refinement(points=32), 0)
+        labels, sample = predict_parts(sequence, FunctionSegmenter(anything), still, Refinement(points=32), 0)
         assert len(labels) == len(sequence.points) and np.isfinite(sample.probability).all(), name
         assert np.isfinite(sample.motion).all() and all(np.isfinite(f).all() for f in sample.flow), name

@@ -48,11 +48,11 @@ class FlowOfSequence:
         return [*(name for name in given if name != "scene_flow"), "scene_flow"]
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
-        """Returns some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
-        index, sequence = numbered
+        """Returns some points of each frame of a sequence, and their flow; its number in the file changes nothing."""
+        _, sequence = numbered
         if self.flow not in METHODS:
             choose_device(self.device)  # a worker multiplies matrices by the library that the command itself chose
-        drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
+        drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
         drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
         if self.as_points:

@@ -68,15 +68,15 @@ class PartsOfSequence:
     length_unit: str
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> tuple[CloudSequence, PartsSample]:
-        """Returns a sequence with its parts, and what else is said of it; its number in the file chooses the points."""
-        index, sequence = numbered
+        """Returns a sequence with its parts, and what else is said of it; its number in the file changes nothing."""
+        _, sequence = numbered
         segmenter = self.segmenter.get()
         estimate = partial(estimate_flow_both_ways, method=self.flow, device=self.device)
         if isinstance(segmenter, SceneSegmenter):
             pairs = pairs_to_report(sequence.num_frames, self.refinement.pairs)
             labels, sample = segmenter.explain(sequence, pairs, self.length_unit)
         else:
-            labels, sample = predict_parts(sequence, index, segmenter, estimate, self.refinement, self.seed)
+            labels, sample = predict_parts(sequence, segmenter, estimate, self.refinement, self.seed)
         sequence.part = labels
         return sequence, sample
 

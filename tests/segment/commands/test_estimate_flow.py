@@ -228,7 +228,7 @@ def test_a_trained_estimator_is_loaded_once_and_sees_the_drawn_points(data, tmp_
     assert len(loads) == 1
     with CloudsReader(tmp_path / "flow.h5") as reader, CloudsReader(data) as before:
         own = reader.read(4)
-        drawn = draw_points(before.read(4), 20, generator(0, SegmentStream.FLOW_POINTS, 4))
+        drawn = draw_points(before.read(4), 20, generator(0, SegmentStream.FLOW_POINTS))
         np.testing.assert_array_equal(own.points, drawn.points)
         first, second = (torch.from_numpy(own.frame(t))[None] for t in (0, 1))
         np.testing.assert_array_equal(own.scene_flow[:20], estimate_flow(first, second, str(tmp_path))[0].numpy())

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.parts import PartsReader
 from tests.support.commands import piped
 
@@ -33,6 +33,27 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc_here, data, run_folde
         assert (sequence.part == sample.probability.argmax(1)).all()
     motion = dpc_here("evaluate", "motion", tmp_path / "parts.h5", "--truth", data, "--json")
     assert motion.returncode == 0 and np.isfinite(json.loads(motion.stdout)["metrics"]["epe3d"])
+
+
+@pytest.mark.parametrize("command", [("predict", "--method", "ward"), ("estimate-flow",)])
+def test_a_sequence_is_told_the_same_alone_and_among_others(command, dpc_here, tmp_path):
+    """More points than are looked at, so that some are drawn."""
+    rng = np.random.default_rng(8)
+    clouds = {name: [np.float32(rng.uniform(-1, 1, (900, 3))) for _ in range(2)] for name in "abc"}
+    for file, names in (("all.h5", "abc"), ("one.h5", "c")):
+        with CloudsWriter(tmp_path / file, fields=[]) as writer:
+            for name in names:
+                writer.write(CloudSequence.from_frames(name, clouds[name]))
+        words = ("--flow", "nearest", "--points", 40, "-o", tmp_path / f"found-{file}")
+        assert dpc_here("segment", command[0], tmp_path / file, *command[1:], *words).returncode == 0
+    reader = PartsReader if command[0] == "predict" else CloudsReader
+    with reader(tmp_path / "found-all.h5") as whole, reader(tmp_path / "found-one.h5") as alone:
+        one, other = whole.read(2), alone.read(0)
+        assert one.points.tobytes() == other.points.tobytes()
+        if command[0] == "predict":
+            assert one.part.tobytes() == other.part.tobytes() and len(set(one.part.tolist())) > 1
+        else:
+            assert len(one.points) == 80 and one.scene_flow.tobytes() == other.scene_flow.tobytes()
 
 
 @pytest.mark.parametrize("method", ["dbscan", "ward", "ssc", "trajaffn"])

@@ -68,7 +68,7 @@ def chest(seed=0, frames=4, points=320, unit=1.0, place=(0, 0, 0), keep=False):
 
 def predicted(sequence, **options):
     """Labels and sample of a sequence."""
-    return predict_parts(sequence, 0, MultibodySegmenter(MultibodySettings()), None, Refinement(**options), 0)
+    return predict_parts(sequence, MultibodySegmenter(MultibodySettings()), None, Refinement(**options), 0)
 
 
 def agreement(labels, sequence):
