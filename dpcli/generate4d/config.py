@@ -150,7 +150,7 @@ class Supervision:
     prior: Prior = setting(
         "auto",
         "What is known beside the input view: nothing, the inflated silhouette, the shape network, the file's views of "
-        "the role train, or a diffusion model; auto takes the network where it is confident, else the inflated silhouette.",
+        "the role train, or a diffusion model; auto takes the network for what looks like a creature, else the inflated silhouette.",
     )
     prior_model: str | None = setting(
         None,

@@ -321,7 +321,7 @@ def test_a_prior_that_was_trained_again_makes_another_fit(tmp_path, dpc_here):
     model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=5))
     made = b"made with other prior weights; write to"  # and nothing else: seed, version and clip are the same
     for offset, code, said in ((1.0, 0, b"fitting"), (1.0, 0, b"already complete"), (2.0, 2, made)):
-        save_shape_model(weights, model, {"size": 16, "confidence": [0.0, offset]})
+        save_shape_model(weights, model, {"size": 16, "confidence": [0.0] * 8 + [offset]})
         done = dpc_here(*words)
         assert done.returncode == code and said in b" ".join(done.stderr.split()), done.stderr
     assert b"is not read with --prior inflated" in dpc_here(*words, "--prior", "inflated", "--force").stderr

@@ -39,6 +39,7 @@ def train_prior(
     """
     settings = ShapeTraining(**CATALOG.resolve(PRESETS[str(given.preset)], given))
     from dpcli.generate4d.commands.train_prior import check_sizes, train_shape_prior
+    from dpcli.generate4d.shape.training.rounds import Sources
     from dpcli.prepare.synthetic.shape_pictures import find_meshes, picture_sources
     from dpcli.prepare.views.views_pipeline import digest_of
 
@@ -50,6 +51,13 @@ def train_prior(
     if learned or held:
         models["models_digest"] = digest_of(file.path for file in [*learned, *held])
     best = train_shape_prior(
-        output, settings, sources[0].make, sources[1].make, models, seed=seed, jobs=jobs, force=force, device=device
+        output,
+        settings,
+        Sources(*(source.make for source in sources)),
+        models,
+        seed=seed,
+        jobs=jobs,
+        force=force,
+        device=device,
     )
     typer.echo(best)

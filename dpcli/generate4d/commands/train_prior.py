@@ -15,7 +15,7 @@ from dpcli.errors import UsageError
 from dpcli.generate4d.shape.model_file import find_shape_model, load_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.training.learning_curves import COLUMNS, draw_curves
-from dpcli.generate4d.shape.training.rounds import MakeModels, draw_round
+from dpcli.generate4d.shape.training.rounds import Kept, Sources, draw_round
 from dpcli.generate4d.shape.training.settings import CATALOG, ShapeTraining
 from dpcli.generate4d.shape.training.trainer import ShapeTrainer
 from dpcli.runtime import provenance
@@ -32,8 +32,7 @@ HELD_OUT_ROUND = 1 << 20  # the number of the round that validates: no training 
 def train_shape_prior(
     output: str,
     settings: ShapeTraining,
-    learned: MakeModels,
-    held: MakeModels,
+    sources: Sources,
     models: dict[str, Any],
     *,
     seed: int,
@@ -41,7 +40,7 @@ def train_shape_prior(
     force: bool,
     device: str = "cpu",
 ) -> Path:
-    """Trains on the pictures that `learned` makes and returns the file of the best weights, by the pictures of `held`.
+    """Trains on the pictures of the models to learn from and returns the file of the best weights, by the held-out ones.
 
     models: what the pictures come from; a run continues only with the same, and with the same weights to start from.
     Raises UsageError where the settings don't fit each other or the folder holds another run.
@@ -59,15 +58,25 @@ def train_shape_prior(
     keep_freed_memory()
     with folder:
         folder.write_settings(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
-        kept = draw_round(held(HELD_OUT_ROUND, settings.data.validation))
+        drawn = [draw_round(make(HELD_OUT_ROUND, settings.data.validation)) for make in sources[1:]]
         weights = sum(value.numel() for value in model.parameters())
         log.info(
-            f"{weights:,} weights; {counted(len(kept.rgba), 'picture')} for validation; {counted(settings.schedule.steps, 'step')}"
+            f"{weights:,} weights; {counted(len(drawn[0].rgba), 'picture')} for validation; {counted(settings.schedule.steps, 'step')}"
         )
-        batch = kept.take(np.arange(len(kept.rgba)))
+        held, creatures, things = (pictures.take(np.arange(len(pictures.rgba))) for pictures in drawn)
         with stop_requested() as stop:  # until here there is nothing to be kept, and a signal ends it at once
+            kept = Kept(held, creatures.pictures, things.pictures)
             trainer = ShapeTrainer(
-                model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop, device=where
+                model,
+                folder,
+                settings.schedule,
+                sources.learned,
+                kept,
+                notes,
+                seed=seed,
+                jobs=jobs,
+                stop=stop,
+                device=where,
             )
             return trainer.run()
 
@@ -85,6 +94,8 @@ def _start(settings: ShapeTraining, folder: RunFolder) -> ShapeNetwork:
     """Returns a new network, or one with the weights of `init`. Raises UsageError where these are of another size."""
     init = settings.data.init
     if init is None:
+        if not settings.schedule.steps:
+            raise UsageError("steps = 0 scores the weights of init again, and none are given")
         return ShapeNetwork(settings.network)
     folder.refuse_inside("init", Path(init))
     found, _ = load_shape_model(init)

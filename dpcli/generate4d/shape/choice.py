@@ -12,7 +12,7 @@ from dpcli.generate4d.targets import Targets
 from dpcli.runtime.progress import log
 from dpcli.runtime.weights import shipped_models
 
-LEAST_CONFIDENCE = 0.5  # below it the network doesn't know a thing like this one
+LEAST_CONFIDENCE = 0.5  # below it the object is unlike the creatures that the network knows
 
 
 def guide(prior: Prior, targets: Targets, model: str | None = None) -> ShapeGuidance | None:
@@ -35,7 +35,9 @@ def guide(prior: Prior, targets: Targets, model: str | None = None) -> ShapeGuid
                 f" larger side in the picture ({inflated.depth_share:.1f} with --prior inflated)"
             )
             return guided
-        log.info(f"shape: inflated silhouette; the network is not sure of this object ({guided.confidence:.2f})")
+        log.info(
+            f"shape: inflated silhouette; the network knows creatures, and this looks like none (confidence {guided.confidence:.2f})"
+        )
     elif prior == "auto":
         log.info("shape: inflated silhouette; this installation has no shape network")
     return ShapeGuidance(Inflated(), targets)

@@ -13,7 +13,7 @@ from dpcli.generate4d.shape.layers import INTERVALS, NEAREST, Camera, ShapeLayer
 from dpcli.generate4d.shape.model_file import DEFAULT, load_shape_model
 from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.silhouette import ball_thickness
-from dpcli.generate4d.shape.training.confidence import probability
+from dpcli.generate4d.shape.training.confidence import confidence
 
 _FILL = 0.89  # of the cut-out's side is filled by the object, as in training
 _LENGTHEN, _LONGEST = 1.5, 3.0  # power of the thickness beside the inflation's; most that an object is stretched
@@ -42,15 +42,15 @@ class Network:
     """Predicts layers by the trained network; the far side has the colors of the near one.
 
     model: a weights file, a folder of `train-prior`, or the name of a shipped network. The turn of the object, and how long
-    it is along the line of sight, are chosen for all frames together. The confidence is the probability that the layers
-    are better than the inflation's.
+    it is along the line of sight, are chosen for all frames together. The confidence says how much a frame is like the
+    creatures that the network learned from, rather than a thing.
     """
 
     name = "network"
 
     def __init__(self, model: str = DEFAULT) -> None:
         self._model, notes = load_shape_model(model)
-        self._size, self._confidence = int(notes["size"]), tuple(notes["confidence"])
+        self._size, self._confidence = int(notes["size"]), notes["confidence"]
 
     @torch.inference_mode()
     def layers(
@@ -65,10 +65,10 @@ class Network:
         if not shown:
             return empty
         cut = torch.stack([_shrink(pictures[index], found[index], self._size) for index in shown])
-        depth, second, confidence = self._predict(cut)
+        depth, second, sure = self._predict(cut)
         for row, index in enumerate(shown):
             empty[index] = _expand(
-                depth[row], second[row], cut[row, 3], pictures[index], found[index], camera, confidence[row]
+                depth[row], second[row], cut[row, 3], pictures[index], found[index], camera, sure[row]
             )
         return empty
 
@@ -87,12 +87,11 @@ class Network:
         depth, second = self._decode(own, cut, angles, length)
         opposite = angles * torch.tensor([-1.0, 1.0])
         depth2, second2 = (x.flip(-1) for x in self._decode(other, flipped, opposite, length))
-        gains = (own.gain + other.gain) / 2
-        confidence = [probability(float(gain), *self._confidence) for gain in gains]
+        sure = confidence(((own.overall + other.overall) / 2).numpy(), self._confidence).tolist()
         depth, second = (depth + depth2) / 2, (second + second2) / 2
         if not model.config.lengths:
             depth = lengthened(depth, second, cut, tilted_plane(angles, cut.shape[-1]))
-        return depth, second, confidence
+        return depth, second, sure
 
     def _decode(self, encoded: Encoded, cut: Tensor, angles: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         depth, second = self._model.decode(encoded, cut, angles, length)

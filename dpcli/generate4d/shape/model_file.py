@@ -13,7 +13,7 @@ from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
 
-_FORMAT, _MAKER = "dpc-shape-1", "dpc generate4d train-prior"
+_FORMAT, _MAKER = "dpc-shape-2", "dpc generate4d train-prior"
 SHIPPED = Path(__file__).parent / "weights"
 _LARGEST = 4096  # pixels
 DEFAULT = "creatures"  # the shipped network
@@ -42,11 +42,16 @@ def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     config, notes = header_settings(path, header, ShapeConfig), header_value(path, header, "notes", dict)
-    size, confidence = notes.get("size"), notes.get("confidence")
-    numbers = [size, *(confidence if isinstance(confidence, list) else [])]
-    if type(size) is not int or not 16 <= size <= _LARGEST or len(numbers) != 3 or not all(map(_is_number, numbers)):
+    size, confidence, count = notes.get("size"), notes.get("confidence"), config.widths[-1] + 1
+    numbers = confidence if isinstance(confidence, list) else []
+    if (
+        type(size) is not int
+        or not 16 <= size <= _LARGEST
+        or len(numbers) != count
+        or not all(map(_is_number, numbers))
+    ):
         raise DataError(
-            f"{path}: its notes say size {size!r:.40} and confidence {confidence!r:.40}, expected pixels and two numbers;"
+            f"{path}: its notes say size {size!r:.40} and confidence {confidence!r:.40}, expected pixels and {count} numbers;"
             " copy it again"
         )
     tensors = {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}

@@ -26,14 +26,17 @@ class Encoded(NamedTuple):
     """Holds what is known before the angles are chosen.
 
     levels: features, fine to coarse. angles: logits (B,2,bins) of the turn about the vertical and about the horizontal.
-    gain: (B) how much smaller the error of the layers will be than that of the inflation, as a logarithm. lengths: logits
-    (B,bins) of the logarithm of the length beside the inflation's; (B,0) from a network that doesn't name it.
+    lengths: logits (B,bins) of the logarithm of the length beside the inflation's; (B,0) from a network that doesn't name it.
     """
 
     levels: list[Tensor]
     angles: Tensor
-    gain: Tensor
     lengths: Tensor
+
+    @property
+    def overall(self) -> Tensor:
+        """Returns the coarsest features (B,C), each averaged over the picture."""
+        return self.levels[-1].float().mean((2, 3))
 
 
 class ShapeNetwork(nn.Module):
@@ -47,7 +50,7 @@ class ShapeNetwork(nn.Module):
         self.config, widths = config, config.widths
         self.down = nn.ModuleList([_Block(20, widths[0]), *(_Block(a, b) for a, b in zip(widths, widths[1:]))])
         self.up = nn.ModuleList([_joint(a + b, a) for a, b in zip(widths, widths[1:])])
-        named = (3 if config.lengths else 2) * config.bins + 1
+        named = (3 if config.lengths else 2) * config.bins
         self.name = nn.Sequential(
             nn.Linear(widths[-1] * _CELLS**2, config.hidden), nn.ReLU(), nn.Linear(config.hidden, named)
         )
@@ -64,14 +67,14 @@ class ShapeNetwork(nn.Module):
         self.register_buffer("length_centers", torch.linspace(*_LENGTHS, config.bins), persistent=False)
 
     def encode(self, pictures: Tensor) -> Encoded:
-        """Returns features, angles and gain of pictures (B,5,S,S)."""
+        """Returns features, angles and lengths of pictures (B,5,S,S)."""
         levels: list[Tensor] = []
         x = functional.pixel_unshuffle(pictures, 2).contiguous(memory_format=torch.channels_last)
         for index, block in enumerate(self.down):
             levels.append(block(functional.max_pool2d(levels[-1], 2) if index else x))
         named = self.name(functional.adaptive_avg_pool2d(levels[-1], _CELLS).flatten(1)).float()
-        angles, lengths = named[:, 1:].split([2 * self.config.bins, named.shape[1] - 1 - 2 * self.config.bins], 1)
-        return Encoded(levels, angles.unflatten(1, (2, -1)), named[:, 0], lengths)
+        angles, lengths = named.split([2 * self.config.bins, named.shape[1] - 2 * self.config.bins], 1)
+        return Encoded(levels, angles.unflatten(1, (2, -1)), lengths)
 
     def decode(self, encoded: Encoded, pictures: Tensor, angles: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         """Returns depth (B,4,S,S) and the logits (B,S,S) of a second interval, for angles (B,2) in radians and the logarithm

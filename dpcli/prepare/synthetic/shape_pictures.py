@@ -28,7 +28,7 @@ from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.text_files import read_text
 
 _POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
-_THINGS = 0.3  # of what is made up; creatures are the rest
+_THINGS = 0.3  # of what is made up for training; creatures are the rest
 _MOST_MISSES = 200  # models in a row that show nothing
 _SAID: set[str] = set()  # what was said of models in this process
 _MOST_TRIANGLES = 200_000  # larger models are passed over, since one would hold up all others
@@ -68,7 +68,7 @@ class PosedModels:
 class PictureSource:
     """Makes rounds of pictures. made, moving: shares of made-up creatures and things and of animated models, 0..1; still
     models have the rest. A folder's share grows with the root of its number of models: many of them are alike. views: pictures of each
-    model in a round. warp: how far proportions are changed at random.
+    model in a round. warp: how far proportions are changed at random. things: share of what is made up.
     """
 
     files: tuple[MeshFile, ...]
@@ -78,6 +78,7 @@ class PictureSource:
     moving: float = 0.35
     views: int = 6
     warp: float = 0.0
+    things: float = _THINGS
 
     def make(self, number: int, count: int) -> PosedModels:
         """Poses the models of a round of `count` pictures. Raises DataError where no model shows anything."""
@@ -104,7 +105,7 @@ class PictureSource:
         moving = [file for file in self.files if file.clips]
         still = [file for file in self.files if not file.clips]
         if kind < self.made or not self.files:
-            return made_thing(rng, _POSES) if rng.random() < _THINGS else made_creature(rng)
+            return made_thing(rng, _POSES) if rng.random() < self.things else made_creature(rng)
         if moving and (kind < self.made + self.moving or not still):
             return _read(_draw_file(moving, rng), rng)
         return _read(_draw_file(still, rng), rng)
@@ -120,9 +121,10 @@ def picture_sources(
     moving: float,
     views: int = 6,
     warp: float = 0.0,
-) -> tuple[PictureSource, PictureSource]:
+) -> tuple[PictureSource, PictureSource, PictureSource, PictureSource]:
     """Returns the source to learn from and the one to validate on: held-out models alone, moving and still ones in the shares
-    of their numbers; what is made up without any.
+    of their numbers; what is made up without any. Then those of creatures and of things, which the confidence tells apart: of
+    what is learned, models that move or stand still, half of them, and what is made up.
     """
     if held and not learned and made < 1:
         log.warn(f"all {len(held)} models are held out: what is made up is learned alone")
@@ -131,6 +133,8 @@ def picture_sources(
         PictureSource(
             tuple(held), size, seed, made=0.0, moving=sum(bool(file.clips) for file in held) / max(len(held), 1)
         ),
+        PictureSource(tuple(file for file in learned if file.clips), size, seed, 0.5, moving=0.5, things=0.0),
+        PictureSource(tuple(file for file in learned if not file.clips), size, seed, 0.5, moving=0.0, things=1.0),
     )
 
 

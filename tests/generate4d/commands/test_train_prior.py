@@ -20,6 +20,7 @@ from safetensors.torch import load_file
 
 from dpcli.generate4d.commands.train_prior import train_shape_prior
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
+from dpcli.generate4d.shape.training.rounds import Sources
 from dpcli.generate4d.shape.training.settings import PRESETS, ShapeTraining
 from dpcli.prepare.synthetic.shape_pictures import picture_sources
 from tests.support.commands import exit_code
@@ -77,6 +78,12 @@ def _step(folder: Path) -> int:
 def test_it_goes_on_from_weights_of_the_same_sizes_only(trained, tmp_path, capsys):
     more = ("--init", trained, "--steps", 2)
     assert exit_code("generate4d", "train-prior", "-o", tmp_path / "more", *WORDS, *more) == 0
+    scored = (*WORDS, "--init", trained, "--steps", 0)
+    assert exit_code("generate4d", "train-prior", "-o", tmp_path / "scored", *scored) == 0
+    before, now = (load_file(place / "best.safetensors") for place in (trained, tmp_path / "scored"))
+    assert all(np.array_equal(now[key], before[key]) for key in before) and _step(tmp_path / "scored") == 0
+    assert exit_code("generate4d", "train-prior", "-o", tmp_path / "nothing", *WORDS, "--steps", 0) == 2
+    assert "steps = 0 scores the weights of init again, and none are given" in capsys.readouterr().err
     wide = ("--set", "widths=8,24")
     assert exit_code("generate4d", "train-prior", "-o", tmp_path / "wide", *WORDS, *more, *wide) == 2
     assert "another configuration" in capsys.readouterr().err
@@ -95,7 +102,7 @@ def test_a_run_goes_on_with_the_models_and_weights_it_began_with_only(trained, t
     arm().write(models / "a.glb")
     assert exit_code(*words, "-o", tmp_path / "run") == 2 and "other models" in capsys.readouterr().err
     quad(1.0).write(models / "a.glb")
-    save_shape_model(weights, load_shape_model(trained)[0], {"size": 16, "confidence": [0.5, 0.5]})
+    save_shape_model(weights, load_shape_model(trained)[0], {"size": 16, "confidence": [0.5] * 17})
     assert exit_code(*words, "-o", tmp_path / "run") == 2 and "other init weights" in capsys.readouterr().err
 
 
@@ -117,13 +124,12 @@ def test_a_card_learns_what_the_cpu_learns(tmp_path):
     settings = ShapeTraining(**PRESETS["tiny"])
     schedule = replace(settings.schedule, steps=4, round=8, reuse=2)
     settings = settings._replace(schedule=schedule, data=replace(settings.data, validation=6))
-    source, held = picture_sources([], [], schedule.size, 0, made=1.0, moving=0.0, views=2, warp=0.1)
+    sources = picture_sources([], [], schedule.size, 0, made=1.0, moving=0.0, views=2, warp=0.1)
+    makes = Sources(*(source.make for source in sources))
     rows = {}
     for device in ("cpu", "cuda"):
         with pretend_card() if device == "cuda" else contextlib.nullcontext():
-            train_shape_prior(
-                tmp_path / device, settings, source.make, held.make, {}, seed=0, jobs=1, force=False, device=device
-            )
+            train_shape_prior(tmp_path / device, settings, makes, {}, seed=0, jobs=1, force=False, device=device)
         rows[device] = [list(row.values())[:-1] for row in json.loads((tmp_path / device / "log.json").read_text())]
     assert len(rows["cpu"]) == 4 and np.ptp([row[1] for row in rows["cpu"]]) > 0
     assert np.allclose(rows["cuda"], rows["cpu"], rtol=1e-3, atol=1e-4)

@@ -25,7 +25,7 @@ def _weights(path, offset: float) -> str:
     """Weights whose confidence is 1 / (1 + exp(-offset)) whatever they see."""
     torch.manual_seed(0)
     model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=5)).eval()
-    save_shape_model(path, model, {"size": 16, "confidence": [0.0, offset]})
+    save_shape_model(path, model, {"size": 16, "confidence": [0.0] * 8 + [offset]})
     return str(path)
 
 
@@ -42,7 +42,7 @@ def targets():
     ("prior", "offset", "name", "said"),
     [
         ("auto", 2.0, "network", "shape: network, confidence 0.88; the depth is"),
-        ("auto", -2.0, "inflated", "the network is not sure of this object (0.12)"),
+        ("auto", -2.0, "inflated", "this looks like none (confidence 0.12)"),
         ("network", -2.0, "network", "shape: network, confidence 0.12"),
         ("inflated", 2.0, "inflated", ""),
     ],

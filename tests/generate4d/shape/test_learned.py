@@ -29,8 +29,8 @@ def weights(tmp_path):
         torch.nn.init.zeros_(layer.weight)
         torch.nn.init.zeros_(layer.bias)
     with torch.no_grad():
-        model.name[-1].bias[[3, 8]] = 20.0  # the middle bins: nothing is turned
-    save_shape_model(tmp_path / "shape.safetensors", model, {"size": 64, "confidence": [1.0, 0.0]})
+        model.name[-1].bias[[2, 7]] = 20.0  # the middle bins: nothing is turned
+    save_shape_model(tmp_path / "shape.safetensors", model, {"size": 64, "confidence": [0.0] * 9})
     return tmp_path / "shape.safetensors"
 
 
@@ -76,7 +76,9 @@ def test_what_is_thicker_than_its_inflation_is_longer_yet():
 
 def test_layers_are_in_order_where_weights_are_random(tmp_path):
     torch.manual_seed(1)
-    save_shape_model(tmp_path / "x.safetensors", ShapeNetwork(CONFIG).eval(), {"size": 32, "confidence": [0.0, 2.0]})
+    save_shape_model(
+        tmp_path / "x.safetensors", ShapeNetwork(CONFIG).eval(), {"size": 32, "confidence": [0.0] * 8 + [2.0]}
+    )
     found = Network(str(tmp_path / "x.safetensors")).layers(np.stack([_disc(50, 40, 25)] * 3), _camera())
     for layers in found:
         assert (np.diff(layers.depth, axis=0) >= 0).all() and np.isfinite(layers.depth).all()
@@ -126,7 +128,9 @@ def test_a_clip_has_one_length_and_rather_too_long_a_one():
 def test_a_network_that_names_lengths_goes_through_a_file(tmp_path):
     torch.manual_seed(2)
     config = ShapeConfig(widths=(4, 8), hidden=8, bins=5, lengths=True)
-    save_shape_model(tmp_path / "x.safetensors", ShapeNetwork(config).eval(), {"size": 32, "confidence": [0.0, 2.0]})
+    save_shape_model(
+        tmp_path / "x.safetensors", ShapeNetwork(config).eval(), {"size": 32, "confidence": [0.0] * 8 + [2.0]}
+    )
     found = Network(str(tmp_path / "x.safetensors")).layers(np.stack([_disc(50, 40, 25)] * 2), _camera())
     assert all((np.diff(layers.depth, axis=0) >= 0).all() and np.isfinite(layers.depth).all() for layers in found)
 

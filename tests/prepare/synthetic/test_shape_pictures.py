@@ -79,7 +79,9 @@ def test_models_are_found_and_held_out_by_the_end_of_their_path(models):
 def test_learned_and_held_out_pictures_come_from_their_own_models(models):
     (models / "held.txt").write_text("square.glb\n")
     files = find_meshes([models], str(models / "held.txt"))
-    learn, check = picture_sources(*files, 16, 0, made=0.0, moving=0.5)
+    learn, check, creatures, things = picture_sources(*files, 16, 0, made=0.0, moving=0.5)
+    assert [file.path.name for file in creatures.files] == ["arm.glb"] and creatures.things == 0
+    assert [file.path.name for file in things.files] == ["still.glb"] and things.things == 1
     assert {file.path.name for file in learn.files} == {"arm.glb", "still.glb"}
     assert {file.path.name for file in check.files} == {"square.glb"}
     assert len(learn.make(0, 8).draw().rgba) == 8 and len(check.make(0, 8).draw().rgba) == 8
@@ -91,7 +93,7 @@ def test_all_held_out_models_validate_whether_they_move_or_not(models, monkeypat
     seen = Counter()
     read = shape_pictures._read
     monkeypatch.setattr(shape_pictures, "_read", lambda file, rng: seen.update([file.path.name]) or read(file, rng))
-    _, check = picture_sources(*find_meshes([models], str(models / "held.txt")), 16, 0, made=0.5, moving=0.35)
+    _, check, *_ = picture_sources(*find_meshes([models], str(models / "held.txt")), 16, 0, made=0.5, moving=0.35)
     assert "all 3 models are held out: what is made up is learned alone" in capsys.readouterr().err
     check.make(0, 60 * check.views)
     assert seen.keys() == {"arm.glb", "square.glb", "still.glb"} and 10 <= seen["still.glb"] <= 30

@@ -1,27 +1,30 @@
-"""The confidence of a shape network: the probability that it is better than the inflation, fitted on held-out models."""
+"""The confidence of a shape network: how much what it looks at is like the creatures it learned from, rather than a thing."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_PULL = 0.1  # toward a slope of 0: few pictures say little
+_WORTH = 4.0  # a creature that is taken for a thing loses more than a thing that is taken for a creature
 
 
-def calibrate(claimed: np.ndarray, better: np.ndarray, rounds: int = 30) -> tuple[float, float]:
-    """Returns slope and offset of p = 1 / (1 + exp(-(slope x claimed + offset))) by Newton's method.
+def fit_confidence(creatures: np.ndarray, things: np.ndarray) -> list[float]:
+    """Returns C weights of features and an offset, of which `confidence` makes a number.
 
-    claimed (N): gains that the network claims. better bool (N): whether its layers had the smaller error.
+    creatures f32 (N,C), things (M,C): overall features of pictures. It is a logistic regression on standardized features, with
+    so strong a penalty that it tells plain things from the rest and leaves what is between to the creatures.
     """
-    rows = np.stack([claimed, np.ones(len(claimed))], 1).astype(np.float64)
-    at = np.zeros(2)
-    for _ in range(rounds):
-        share = 1 / (1 + np.exp(-rows @ at))
-        slope = rows.T @ (better - share) - _PULL * at
-        bend = (rows * (share * (1 - share))[:, None]).T @ rows + _PULL * np.eye(2)
-        at = at + np.clip(np.linalg.solve(bend, slope), -2, 2)
-    return float(at[0]), float(at[1])
+    from sklearn.linear_model import LogisticRegression
+
+    rows = np.concatenate([creatures, things]).astype(np.float64)
+    known = np.arange(len(rows)) < len(creatures)
+    mean, spread = rows.mean(0), np.maximum(rows.std(0), 1e-6)
+    fitted = LogisticRegression(C=1 / len(rows), class_weight={True: _WORTH, False: 1.0}, max_iter=1000)
+    fitted.fit((rows - mean) / spread, known)
+    weights = fitted.coef_[0] / spread
+    return [*map(float, weights), float(fitted.intercept_[0] - weights @ mean)]
 
 
-def probability(claimed: float, slope: float, offset: float) -> float:
-    """Returns the confidence 0..1 that a claimed gain stands for."""
-    return float(1 / (1 + np.exp(-(slope * claimed + offset))))
+def confidence(features: np.ndarray, fitted: list[float]) -> np.ndarray:
+    """Returns the confidence f64 (B), 0..1, of overall features (B,C): 0.5 and above is for creatures."""
+    logit = features.astype(np.float64) @ np.array(fitted[:-1]) + fitted[-1]
+    return 1 / (1 + np.exp(-logit.clip(-700, 700)))

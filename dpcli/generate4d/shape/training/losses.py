@@ -1,4 +1,4 @@
-"""The losses of a shape network: errors of layers and of their differences, angles and length of the whole, its own gain."""
+"""The losses of a shape network: errors of layers and of their differences, angles and length of the whole."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, inflated_layers, tilted_plane
+from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.training.rounds import Batch
 
 _RIDGE = 0.005  # squared sides of the picture: a narrow object has no angle to speak of
 _WEIGHTS = (2.0, 1.0, 0.5, 0.5)  # of the layers: all that is shown from a side hangs on the front
-_SOFT = 0.005  # sides: differences of errors below this mean nothing
 
 
 def object_angles(depth: Tensor) -> Tensor:
@@ -90,14 +89,6 @@ def shape_loss(model: ShapeNetwork, batch: Batch, guessed: Tensor) -> tuple[Tens
     error = depth_error(depth, batch.depth)
     there = ~batch.depth[:, 0].isnan()
     presence = functional.binary_cross_entropy_with_logits(second[there], (~batch.depth[:, 2].isnan()).float()[there])
-    gain = gain_of(error.detach(), batch)
-    certain = functional.smooth_l1_loss(encoded.gain[guessed], gain[guessed]) if guessed.any() else 0 * error.sum()
     smooth = difference_error(depth, batch.depth)
-    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + angles + lengths + 0.1 * certain
+    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + angles + lengths
     return loss, {"depth": error.detach().mean(), "angles": angles.detach(), "second": presence.detach()}
-
-
-def gain_of(error: Tensor, batch: Batch) -> Tensor:
-    """Returns how much smaller the errors (B) are than those of the inflation, as a logarithm."""
-    inflated = depth_error(inflated_layers(batch.pictures[:, 4]), batch.depth)
-    return (inflated + _SOFT).log() - (error + _SOFT).log()

@@ -30,11 +30,32 @@ class Models(Protocol):
 MakeModels = Callable[[int, int], Models]  # (number of the round, count of its pictures), picklable
 
 
+class Sources(NamedTuple):
+    """Holds what makes the models of a training: to learn from, to validate on, and both kinds that the confidence tells apart."""
+
+    learned: MakeModels
+    held: MakeModels
+    creatures: MakeModels
+    things: MakeModels
+
+
 class Batch(NamedTuple):
     """Holds pictures (B,5,S,S) as `ShapeNetwork` takes them and their layers (B,4,S,S), NaN where there is none."""
 
     pictures: Tensor
     depth: Tensor
+
+
+class Kept(NamedTuple):
+    """Holds the pictures that judge a network: those of held-out models, and those (N,5,S,S) of creatures and of things."""
+
+    held: Batch
+    creatures: Tensor
+    things: Tensor
+
+    def to(self, device: torch.device) -> Kept:
+        """Returns the pictures on a device."""
+        return Kept(Batch(*(x.to(device) for x in self.held)), self.creatures.to(device), self.things.to(device))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dpcli.runtime.settings.fields import check, setting
 class ShapeSchedule:
     """Holds how long a shape network learns, from pictures of which size, and how often it sees each."""
 
-    steps: int = setting(20_000, "Steps of the optimizer.", least=1)
+    steps: int = setting(20_000, "Steps of the optimizer; 0: the weights of init are only scored again.", least=0)
     batch: int = setting(64, "Pictures per step, on which the rotation of the whole object is learned.", least=1)
     decoded: int = setting(16, "Pictures of each step on which the layers are learned, too: the easier part.", least=1)
     size: int = setting(
@@ -45,7 +45,11 @@ class ShapeData:
     held_out: str | None = setting(
         None, "A text file of models used for validation only, one path or end of a path per line."
     )
-    validation: int = setting(384, "Pictures of held-out models that choose the best weights.", least=1)
+    validation: int = setting(
+        384,
+        "Pictures of held-out models that choose the best weights; as many of creatures, and of things, fit the confidence.",
+        least=1,
+    )
     init: str | None = setting(None, "Weights to start from: a file or a folder of an earlier training.")
 
     def __post_init__(self) -> None:

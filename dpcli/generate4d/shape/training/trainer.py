@@ -12,13 +12,15 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from dpcli.generate4d.shape.model_file import save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork, inflated_layers
-from dpcli.generate4d.shape.training.confidence import calibrate
-from dpcli.generate4d.shape.training.losses import depth_error, gain_of, object_angles, object_length, shape_loss
-from dpcli.generate4d.shape.training.rounds import Batch, MakeModels, Window, open_window
+from dpcli.generate4d.shape.training.confidence import fit_confidence
+from dpcli.generate4d.shape.training.losses import depth_error, object_angles, object_length, shape_loss
+from dpcli.generate4d.shape.training.rounds import Batch, Kept, MakeModels, Window, open_window
 from dpcli.generate4d.shape.training.settings import ShapeSchedule
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.runtime.progress import Progress, log
@@ -33,7 +35,7 @@ _MEMORY = 0.999  # of the running mean of the weights
 
 
 class ShapeTrainer:
-    """Trains a network on rounds of pictures; `best.safetensors` has the running mean of least error on `held`.
+    """Trains a network on rounds of pictures; `best.safetensors` has the running mean of least error on held-out models.
 
     Adam, cosine learning rate. Every `log_every` steps (None: 60 times in all) the log gets a row and the state is saved.
     """
@@ -44,7 +46,7 @@ class ShapeTrainer:
         folder: RunFolder,
         schedule: ShapeSchedule,
         make: MakeModels,
-        held: Batch,
+        kept: Kept,
         notes: dict[str, Any],
         *,
         seed: int,
@@ -55,7 +57,7 @@ class ShapeTrainer:
         self.model = model.to(device, memory_format=torch.channels_last)
         self.mean, self.device = deepcopy(self.model).eval(), device
         self.folder, self.schedule, self.make = folder, schedule, make
-        self.held = Batch(*(tensor.to(device) for tensor in held))
+        self.kept = kept.to(device)
         self.notes, self.seed, self.jobs, self.stop = notes, seed, jobs, stop
         self.log_every = max(1, schedule.steps // 60)
         self.per_round = max(1, schedule.round * schedule.reuse // schedule.batch)
@@ -78,6 +80,8 @@ class ShapeTrainer:
             at = self.step // self.per_round
             with open_window(self.make, sizes.round, sizes.rounds, at, rounds, self.jobs, self.device) as window:
                 self._learn(window)
+        elif not sizes.steps and state is None:
+            self._end_interval(0.0)
         self.folder.draw_curves()
         return self.folder.file("best.safetensors")
 
@@ -103,7 +107,7 @@ class ShapeTrainer:
     def _learning_rate(self) -> float:
         """Returns the learning rate of the step."""
         warm = min(1.0, (self.step + 1) / _WARM)
-        return self.schedule.lr * warm * 0.5 * (1 + math.cos(math.pi * self.step / self.schedule.steps))
+        return self.schedule.lr * warm * 0.5 * (1 + math.cos(math.pi * self.step / max(self.schedule.steps, 1)))
 
     def _one_step(self, window: Window) -> None:
         """Learns from one batch and takes it into the running mean."""
@@ -140,7 +144,8 @@ class ShapeTrainer:
         """Validates, writes a row of the log, and saves."""
         steps = self.sums.pop("steps")
         row = {"step": self.step, **{key: value / steps for key, value in self.sums.items()}}
-        measured, confidence = validate(self.mean, self.held)
+        measured = validate(self.mean, self.kept.held)
+        confidence = fit_confidence(*(overall_features(self.mean, shown) for shown in self.kept[1:]))
         row |= measured | {"learning_rate": self._learning_rate(), "seconds": round(self.spent + seconds, 2)}
         log.detail(f"{row}")
         self.folder.log(row)
@@ -168,27 +173,30 @@ class ShapeTrainer:
 
 
 @torch.inference_mode()
-def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[str, float], tuple[float, float]]:
-    """Returns measures of a network that names the angles itself, and slope and offset of its confidence.
+def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> dict[str, float]:
+    """Returns measures of a network that names the angles itself.
 
     validation_loss, validation_inflated: error of its layers and of the inflation's, sides of the picture;
     validation_angle: mean error of the turn about the vertical, degrees; validation_length: of the logarithm of the length.
     """
     model.eval()
-    errors, plain, turned, longer, claimed, gained = [], [], [], [], [], []
+    errors, plain, turned, longer = [], [], [], []
     for start in range(0, len(held.pictures), batch):
         part = Batch(*(tensor[start : start + batch] for tensor in held))
         encoded = model.encode(part.pictures)
         angles, length = model.mean_angles(encoded.angles), model.mean_length(encoded.lengths)
-        error = depth_error(model.decode(encoded, part.pictures, angles, length)[0], part.depth)
-        errors.append(error)
+        errors.append(depth_error(model.decode(encoded, part.pictures, angles, length)[0], part.depth))
         plain.append(depth_error(inflated_layers(part.pictures[:, 4]), part.depth))
         true = object_angles(part.depth)
         turned.append((angles - true)[:, 0].abs().rad2deg())
         longer.append((length - object_length(part, true)).abs())
-        claimed.append(encoded.gain)
-        gained.append(gain_of(error, part))
     names = ("validation_loss", "validation_inflated", "validation_angle", "validation_length")
     means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned, longer)]
-    confidence = calibrate(torch.cat(claimed).cpu().numpy(), (torch.cat(gained) > 0).cpu().numpy())
-    return dict(zip(names, means)), confidence
+    return dict(zip(names, means))
+
+
+@torch.inference_mode()
+def overall_features(model: ShapeNetwork, pictures: Tensor, batch: int = 64) -> np.ndarray:
+    """Returns the overall features f32 (N,C) of pictures (N,5,S,S)."""
+    model.eval()
+    return torch.cat([model.encode(part).overall for part in pictures.split(batch)]).cpu().numpy()

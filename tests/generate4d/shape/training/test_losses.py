@@ -14,7 +14,7 @@ from dpcli.errors import DpcError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.learned import choose_angles
 from dpcli.generate4d.shape.network import ShapeNetwork, tilted_plane
-from dpcli.generate4d.shape.training.confidence import calibrate, probability
+from dpcli.generate4d.shape.training.confidence import confidence, fit_confidence
 from dpcli.generate4d.shape.training.losses import depth_error, object_angles, object_length, shape_loss
 from dpcli.generate4d.shape.training.rounds import Batch
 from dpcli.generate4d.shape.training.trainer import ShapeTrainer
@@ -74,15 +74,17 @@ def test_a_clip_is_turned_as_all_paths_together_say_or_not_at_all():
     assert (found[:, 0] > 0.5).all() and (found[:, 1] == 0).all()
 
 
-def test_confidence_is_the_share_that_was_better():
+def test_confidence_tells_things_from_creatures_and_leaves_the_middle_to_these():
+    """Features of any scale and offset, one of them always the same; seen again and new ones."""
     rng = np.random.default_rng(1)
-    claimed = rng.normal(size=4000)
-    better = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * claimed - 0.4)))
-    slope, offset = calibrate(claimed, better.astype(float))
-    assert (slope, offset) == pytest.approx((1.5, -0.4), abs=0.15)
-    assert probability(0.0, slope, offset) == pytest.approx(1 / (1 + math.exp(0.4)), abs=0.04)
-    slope, offset = calibrate(claimed, np.ones(4000))  # always better: high, and finite
-    assert 0.9 < probability(0.0, slope, offset) <= 1 and np.isfinite([slope, offset]).all()
+    creatures, things = (
+        np.append(1000 + 50 * (rng.normal(size=(200, 30)) + middle), np.ones((200, 1)), axis=1) for middle in (1, -1)
+    )
+    fitted = fit_confidence(creatures[:100], things[:100])
+    assert len(fitted) == 32
+    assert (confidence(creatures[100:], fitted) >= 0.5).all() and (confidence(things[100:], fitted) < 0.5).mean() > 0.9
+    assert confidence(np.array([[1000.0] * 30 + [1]]), fitted) > 0.6
+    assert confidence(np.array([[1e9] * 31, [-1e9] * 31]), fitted).tolist() == pytest.approx([1, 0])
 
 
 def test_a_loss_that_runs_away_from_where_it_began_ends_the_training():
