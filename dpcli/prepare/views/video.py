@@ -26,6 +26,7 @@ from dpcli.prepare.decode.color_frames import (
 )
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
+from dpcli.prepare.views.cameras_beside import tell_cameras_beside
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
 from dpcli.prepare.views.masks import mask_of_video, read_mask
 from dpcli.prepare.views.square_crop import Crop, crop_around, pieces, touches_border, union, visible_box, whole_picture
@@ -100,6 +101,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     """
     options.check()
     frames = open_frames(path, options.pattern)
+    tell_cameras_beside(path, options.views_cameras)
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]

@@ -958,13 +958,54 @@ def test_what_is_left_out_is_told_once(tmp_path, capfd, other, pattern):
     assert capfd.readouterr().err.count("left out") == 1
 
 
-@pytest.mark.parametrize("beside", ["sparse", "../transforms.json", "../cameras", "0.xmp", "edits.xmp", "../../sparse"])
-def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(tmp_path, capfd, beside):
-    folder = save(tmp_path / "scene" / "images", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
-    (folder / beside).write_text('<x:xmpmeta xcr:Position="1"/>' if beside == "0.xmp" else "<x:xmpmeta/>")
-    open_frames(folder)
-    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is assumed to stand still"
-    assert (said in capfd.readouterr().err) == (beside not in ("edits.xmp", "../../sparse"))
+@pytest.mark.parametrize(
+    ("folder", "beside", "words", "told"),
+    [
+        ("scene/images", "sparse", "", True),
+        ("scene/images", "../transforms.json", "", True),
+        ("scene/images", "../cameras", "", True),
+        ("scene/images", "../../sparse", "", False),
+        ("scene/images", "0.xmp", '<x:xmpmeta xcr:Position="1"/>', True),
+        ("scene/images", "edits.xmp", "<x:xmpmeta/>", False),
+        ("scene/images_4", "../poses_bounds.npy", "", True),
+        ("scene/rgb/1x", "../../camera", "", True),
+        ("scene/images/01", "../../intri.yml", "", True),
+        ("scene/train", "../transforms_train.json", "", True),
+        ("scene/Camera_B1", "../annots.npy", "", True),
+        ("scene/Camera_B1", "../cameras.json", "", False),
+        ("scene/rgb", "../metadata.json", '{"w": 1440, "poses": [[0, 0, 0, 1, 0, 0, 0]]}', True),
+        ("scene/rgb", "../metadata.json", '{"title": "a fox"}', False),
+        ("scene/7", "0.pose.txt", "1 0 0 0", True),
+        ("scene/scan", "0.json", '{"cameraPoseARFrame": [1, 0]}', True),
+        ("scene/scan", "0.json", '{"shapes": []}', False),
+    ],
+)
+def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(
+    tmp_path, capfd, folder, beside, words, told
+):
+    place = save(tmp_path / folder, [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (place / beside).write_text(words)
+    name = beside.rpartition("/")[2]
+    said = f"{place.name}: {name}: not read; the camera of a clip is assumed to stand still"
+    video_clip(place, SMALL)
+    assert (said in capfd.readouterr().err) == told
+    open_frames(place)  # as masks are
+    assert "assumed" not in capfd.readouterr().err
+
+
+def test_a_list_of_cameras_that_is_read_is_not_told_as_unread(tmp_path, capfd):
+    place = save(tmp_path / "rgba", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    views = save(tmp_path / "views" / "view0", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png").parent
+    (tmp_path / "cameras.json").write_text('[{"azimuth": 90, "elevation": 0}]')
+    video_clip(place, VideoOptions(size=64, views=views, views_cameras=tmp_path / "cameras.json"))
+    assert "not read" not in capfd.readouterr().err
+
+
+def test_cameras_beside_a_video_are_told(tmp_path, capfd):
+    path = uneven_video(tmp_path / "rgb.mp4")
+    (tmp_path / "camera_matrix.csv").write_text("1,0,0")
+    video_clip(path, VideoOptions(size=64, background="keep"))
+    assert "rgb.mp4: camera_matrix.csv: not read" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
