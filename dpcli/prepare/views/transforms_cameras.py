@@ -31,6 +31,8 @@ _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
 _LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _LONGEST = 1000  # times the width of the picture: no lens for objects is that long
+_OFF_CENTER = 0.2  # of the picture: what a principal point lies off its middle if the camera isn't of this picture
+_DISAGREE = 0.02  # of a focal length: by how much its angle may make another
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
 
@@ -85,6 +87,26 @@ class View:
             )
         return np.array([[fx * across, 0, cx * across], [0, fy * down, cy * down], [0, 0, 1.0]])
 
+    def doubts(self, width: int, height: int) -> dict[str, str]:
+        """Returns what makes a lens doubtful for pictures of this size, by its kind, in words for the log."""
+        found, matrix = {}, self.intrinsics(width, height)
+        for number, (axis, extent) in enumerate((("x", width), ("y", height))):
+            if abs(matrix[number, 2] / extent - 0.5) > _OFF_CENTER:
+                found["center"] = (
+                    f"a principal point at {matrix[0, 2]:.4g}, {matrix[1, 2]:.4g} in pictures of {width}x{height}, far from their"
+                    " middle: right for cut-outs only; of pictures that were resized, w and h must be the size that cx, cy, fl_x"
+                    " belong to"
+                )
+            angle, focal = self.lens.get(f"camera_angle_{axis}"), self.lens.get(f"fl_{axis}")
+            if angle and focal:
+                own = 0.5 * self.lens.get("wh"[number], extent) / float(np.tan(0.5 * angle))
+                if abs(own / focal - 1) > _DISAGREE:
+                    found["angle"] = (
+                        f"fl_{axis} {focal:.4g} is taken, though camera_angle_{axis} {angle:.4g} makes it {own:.4g} pixels; leave"
+                        " out the wrong one"
+                    )
+        return found
+
 
 def _focal(lens: dict[str, float], axis: str, extent: float) -> float:
     """Returns the focal length along an axis in pixels, 0 where the file doesn't say it."""
@@ -99,10 +121,10 @@ def transforms_files(path: Path) -> list[Path]:
     return [path] if path.name in FILES and path.is_file() else []
 
 
-def read_views(path: Path) -> tuple[list[View], list[float]]:
+def read_views(path: Path, *, quiet: bool = False) -> tuple[list[View], list[float]]:
     """Returns still cameras that have a picture at every time, training ones first, and the times, rising.
 
-    Raises DataError when there is none, or at what of the files can't be used.
+    quiet: what is left out isn't told. Raises DataError when there is none, or at what of the files can't be used.
     """
     views: dict[bytes, View] = {}
     for file in transforms_files(path):
@@ -114,12 +136,31 @@ def read_views(path: Path) -> tuple[list[View], list[float]]:
             f"{path}: the camera moves or zooms ({len(views)} poses and lenses for {len(times)} times); a file of views holds "
             "still cameras with a picture at every time\nRender or select at least one camera over all times"
         )
-    if len(whole) < len(views):
+    if len(whole) < len(views) and not quiet:
         log.warn(
             f"{path}: {len(views) - len(whole)} of {len(views)} cameras without a picture at some of the {len(times)} times; left out"
         )
     whole.sort(key=lambda view: view.role != "train")
-    return whole, sorted(times)
+    return _each_once(path, whole, quiet), sorted(times)
+
+
+def _each_once(path: Path, views: list[View], quiet: bool) -> list[View]:
+    """Returns the views without those whose pictures another one has, too: a list of all pictures beside one of the tests.
+
+    They are for testing, unless that leaves none to train on, as where the list of training is copied to please a loader.
+    """
+    shown = {
+        role: {p for view in views if view.role == role for p in view.paths.values()} for role in ("train", "test")
+    }
+    both = shown["train"] & shown["test"]
+    left = "test" if shown["train"] <= shown["test"] else "train"
+    kept = [view for view in views if view.role != left or both.isdisjoint(view.paths.values())]
+    if len(kept) < len(views) and not quiet:
+        log.warn(
+            f"{path}: {len(views) - len(kept)} of {len(views)} cameras listed for training and for testing; taken for"
+            f" {'testing' if left == 'train' else 'training'} alone"
+        )
+    return kept
 
 
 def named_up(path: Path) -> np.ndarray | None:

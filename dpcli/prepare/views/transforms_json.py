@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.masks import read_mask
-from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_of_cameras
+from dpcli.prepare.views.orbit_world import into_orbit, shares_of_boxes, sphere_of_silhouettes, up_of_cameras
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
 from dpcli.prepare.views.transforms_cameras import View, named_up, read_views, transforms_files
 from dpcli.prepare.views.video import VideoOptions, spread_frames
@@ -23,16 +24,18 @@ from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
 
+_SHARED = 0.95  # of a box around the object, at least, is possible where all cameras are right
+
 
 def is_transforms(path: Path) -> bool:
     """Returns whether a path is a folder of this kind, or a file of its cameras."""
     return bool(transforms_files(path))
 
 
-def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
-    """Returns options and digests of everything read, for provenance."""
+def transforms_config(path: Path, options: VideoOptions, *, quiet: bool = True) -> dict[str, Any]:
+    """Returns options and digests of everything read, for provenance; quiet: what is left out isn't told."""
     _check(options)
-    views, times = read_views(path)
+    views, times = read_views(path, quiet=quiet)
     config = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -77,6 +80,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
     poses = np.stack([world.pose(pose) for pose in poses])
+    _doubt(path, views, intrinsics, poses, list(boxes), list(sizes))
     crops = [whole_picture(*size) for size in sizes]
     header = ViewsHeader(
         options.name or (path if path.is_dir() else path.parent).resolve().name,
@@ -96,6 +100,29 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
                 yield number, row, crops[number].apply(_cut(view, time, options), options.size)
 
     return Clip(header, pictures)
+
+
+def _doubt(
+    path: Path,
+    views: list[View],
+    intrinsics: np.ndarray,
+    poses: np.ndarray,
+    boxes: list[Box],
+    sizes: list[tuple[int, int]],
+) -> None:
+    """Warns of lenses and poses that can hardly be those of the pictures."""
+    doubts = [view.doubts(*size) for view, size in zip(views, sizes, strict=True)]
+    for kind in {kind: None for one in doubts for kind in one}:
+        said = [one[kind] for one in doubts if kind in one]
+        log.warn(f"{path}: {counted(len(said), 'camera')}: {said[0]}")
+    shares = shares_of_boxes(intrinsics, poses, boxes, sizes)
+    if shares.min() < _SHARED:
+        worst = int(shares.argmin())
+        log.warn(
+            f"{path}: the cameras contradict one another: of the box around the object in {next(iter(views[worst].paths.values())).name}"
+            f" the other views leave {shares[worst]:.0%} possible, expected nearly 100%. Check the poses (camera to world, axes"
+            " as in OpenGL? mirrored? in another order?), the lenses, and that nothing but the object is left in the pictures"
+        )
 
 
 def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:

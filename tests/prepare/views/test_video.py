@@ -19,7 +19,7 @@ from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import read_cameras
-from dpcli.prepare.views.orbit_world import up_of_cameras
+from dpcli.prepare.views.orbit_world import shares_of_boxes, up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
@@ -803,6 +803,118 @@ def test_bad_transforms(tmp_path, change, message):
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
         transforms_clip(folder, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({}, ""),
+        ({"fl_x": FOCAL, "camera_angle_y": 2 * np.arctan(24 / FOCAL)}, ""),
+        ({"fl_x": 1.1 * FOCAL}, "3 cameras: fl_x 96.43 is taken, though camera_angle_x 0.7 makes it 87.66 pixels"),
+        ({"fl_y": FOCAL, "camera_angle_y": 0.7}, "fl_y 87.66 is taken, though camera_angle_y 0.7 makes it 65.75"),
+        (
+            {"fl_x": 2 * FOCAL, "cx": 64, "cy": 48},
+            "a principal point at 64, 48 in pictures of 64x48, far from their middle",
+        ),
+        ({"cx": 64, "cy": 48, "w": 128, "h": 96}, ""),
+    ],
+)
+def test_a_lens_that_can_hardly_be_that_of_its_pictures_is_told(tmp_path, capsys, change, told):
+    """Pictures that were made smaller beside the camera of the large ones, and numbers of one lens that disagree."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    transforms_clip(folder, SMALL)
+    said = capsys.readouterr().err
+    assert told in said and ("warning" in said) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ("listed", "tested", "roles"),
+    [
+        ((0, 1, 2), (2,), ["reference", "train", "test"]),
+        ((0, 1, 2), (0,), ["reference", "train", "test"]),
+        ((0, 1), (0, 1), ["reference", "train"]),
+        ((0, 1), (0, 1, 2), ["reference", "train", "test"]),
+        ((0, 1), (2,), ["reference", "train", "test"]),
+    ],
+)
+def test_a_camera_listed_for_training_and_for_testing_is_of_one_of_them(tmp_path, capsys, listed, tested, roles):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for name, cameras in (("transforms_train.json", listed), ("transforms_test.json", tested)):
+        frames = [data["frames"][3 * camera + frame] for camera in cameras for frame in range(3)]
+        (folder / name).write_text(json.dumps({**data, "frames": frames}))
+    assert transforms_clip(folder, SMALL).header.role == roles
+    twice = len(set(listed) & set(tested))
+    assert capsys.readouterr().err.count(f"{twice} of {len(listed) + len(tested)} cameras listed for training") == bool(
+        twice
+    )
+
+
+def test_cameras_left_out_are_told_once(tmp_path, capfd):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "frames": data["frames"][:-1]}))
+    assert exit_code("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32") == 0
+    assert capfd.readouterr().err.count("1 of 3 cameras without a picture at some of the 3 times") == 1
+
+
+def seen_points(seed: int, views: int) -> tuple[np.ndarray, np.ndarray, list, list]:
+    """Lenses, poses, and the exact boxes of points about the origin in pictures of 320x240, cut at their borders."""
+    rng = np.random.default_rng(seed)
+    points = np.c_[rng.normal(0, 0.3, (30, 3)) * rng.uniform(0.4, 1.6, 3), np.ones(30)]
+    poses = np.stack([orbit_pose(*rng.uniform((0, -0.3), (6.3, 1)), rng.uniform(2, 4)) for _ in range(views)])
+    poses[:, :2, 3] += rng.normal(0, 0.15, (views, 2))
+    lenses = np.array(
+        [
+            [[f, 0, x], [0, g, y], [0, 0, 1]]
+            for f, g, x, y in rng.uniform((250, 250, 140, 100), (400, 400, 180, 140), (views, 4))
+        ]
+    )
+    boxes = []
+    for lens, pose in zip(lenses, poses):
+        pixels = points @ (lens @ pose[:3]).T
+        pixels = np.clip(pixels[:, :2] / pixels[:, 2:], 0, (320, 240))
+        boxes.append((*pixels.min(0), *pixels.max(0)))
+    return lenses, poses, boxes, [(320, 240)] * views
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_right_cameras_leave_all_of_every_box_possible(seed, views):
+    shares = shares_of_boxes(*seen_points(seed, views))
+    assert shares.shape == (views,) and shares.min() > 1 - 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("wrong", ["inverted", "lens of larger pictures", "exchanged", "mirrored"])
+def test_wrong_cameras_leave_less(seed, wrong):
+    lenses, poses, boxes, sizes = seen_points(seed, 8)
+    if wrong == "inverted":
+        poses = np.linalg.inv(poses)
+    elif wrong == "exchanged":
+        poses = poses[[1, 0, *range(2, 8)]]
+    elif wrong == "mirrored":
+        poses = np.diag([1, -1, 1, 1.0]) @ poses @ np.diag([1, -1, 1, 1.0])
+    else:
+        lenses = lenses * np.array([2, 2, 1])[:, None]
+    assert shares_of_boxes(lenses, poses, boxes, sizes).min() < 0.95
+
+
+def test_cameras_that_contradict_one_another_are_told(tmp_path, capsys):
+    """World to camera in place of camera to world, of cameras that don't look at the world's origin."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += (0.5, 1, 0)
+        frame["transform_matrix"] = np.linalg.inv(pose).tolist()
+    path.write_text(json.dumps(data))
+    transforms_clip(folder, SMALL)
+    assert "scene: the cameras contradict one another: of the box around the object in r_" in capsys.readouterr().err
 
 
 def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
