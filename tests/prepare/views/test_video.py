@@ -508,6 +508,40 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
 
 
+@pytest.mark.parametrize("by_frame", [False, True])
+@pytest.mark.parametrize(
+    ("names", "azimuths", "order", "told"),
+    [
+        (
+            ["az-90", "az-30", "az30", "az150"],
+            [-90, -30, 30, 150],
+            [0, 1, 2, 3],
+            "az-90 at 270, az-30 at 330, az30 at 30",
+        ),
+        (["r_330", "r_0", "r_90"], [330, 0, 90], [0, 1, 2], "r_330 at 330, r_0 at 0, r_90 at 90"),
+        (["cam2", "cam10", "cam1"], [20, 100, 10], [2, 0, 1], "cam1 at 20, cam2 at 100, cam10 at 10"),
+        (
+            ["front", "left", "back"],
+            [0, 90, 180],
+            [2, 0, 1],
+            "back at 0, front at 90, left at 180; taken in the order of",
+        ),
+    ],
+)
+def test_views_belong_to_the_cameras_that_their_names_say(tmp_path, capsys, by_frame, names, azimuths, order, told):
+    """A sign or words in names make another order than the list's, which is noticed, or told."""
+    clip = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(2)])
+    for number, name in enumerate(names):
+        for frame in range(2):
+            place = tmp_path / "v" / (f"frame{frame}/{name}.png" if by_frame else f"{name}/{frame}.png")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(disc((24, 24), 8, color=(200, 40 + 40 * number, 30))).save(place)
+    (tmp_path / "c.json").write_text(json.dumps([{"azimuth": a, "elevation": 0} for a in azimuths]))
+    found = read(video_clip(clip, VideoOptions(size=64, views=tmp_path / "v", views_cameras=tmp_path / "c.json")))
+    seen = [round((int(found[view, 1][32, 24, 1]) - 40) / 40) for view in range(1, len(names) + 1)]
+    assert seen == order and told in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("recenter", [False, True])
 @pytest.mark.parametrize("shape", [(32, 32), (61, 40), (40, 61)])
 def test_the_angle_of_a_camera_spans_its_own_whole_pictures_height(tmp_path, shape, recenter):
