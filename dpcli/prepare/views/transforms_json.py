@@ -66,7 +66,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     views, times = read_views(path)
     seconds, chosen = _seconds(path, times, options.fps), spread_frames(len(times), options.frames)
     times = [times[index] for index in chosen]
-    boxes, sizes = zip(*(_look(view, times, options) for view in views))
+    boxes, sizes, always = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([view.intrinsics(*size) for view, size in zip(views, sizes, strict=True)])
     if any(high > wide and view.has_angle_across_alone for view, (wide, high) in zip(views, sizes)):
         log.warn(
@@ -80,7 +80,17 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
     poses = np.stack([world.pose(pose) for pose in poses])
-    _doubt(path, views, intrinsics, poses, list(boxes), list(sizes))
+    doubts = [view.doubts(*size) for view, size in zip(views, sizes, strict=True)]
+    for kind in {kind: None for one in doubts for kind in one}:
+        said = [one[kind] for one in doubts if kind in one]
+        log.warn(f"{path}: {counted(len(said), 'camera')}: {said[0]}")
+    if asked := [
+        k for k in range(len(views)) if always[k]
+    ]:  # where it is out of sight at times, its box isn't all of its way
+        names = [next(iter(views[k].paths.values())).name for k in asked]
+        _tell_contradiction(
+            path, names, intrinsics[asked], poses[asked], [boxes[k] for k in asked], [sizes[k] for k in asked]
+        )
     crops = [whole_picture(*size) for size in sizes]
     header = ViewsHeader(
         options.name or (path if path.is_dir() else path.parent).resolve().name,
@@ -102,26 +112,22 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     return Clip(header, pictures)
 
 
-def _doubt(
+def _tell_contradiction(
     path: Path,
-    views: list[View],
+    names: list[str],
     intrinsics: np.ndarray,
     poses: np.ndarray,
     boxes: list[Box],
     sizes: list[tuple[int, int]],
 ) -> None:
-    """Warns of lenses and poses that can hardly be those of the pictures."""
-    doubts = [view.doubts(*size) for view, size in zip(views, sizes, strict=True)]
-    for kind in {kind: None for one in doubts for kind in one}:
-        said = [one[kind] for one in doubts if kind in one]
-        log.warn(f"{path}: {counted(len(said), 'camera')}: {said[0]}")
+    """Warns of cameras that can't all be those of the boxes around the object; names: of a picture of each."""
     shares = shares_of_boxes(intrinsics, poses, boxes, sizes)
     if shares.min() < _SHARED:
         worst = int(shares.argmin())
         log.warn(
-            f"{path}: the cameras contradict one another: of the box around the object in {next(iter(views[worst].paths.values())).name}"
-            f" the other views leave {shares[worst]:.0%} possible, expected nearly 100%. Check the poses (camera to world, axes"
-            " as in OpenGL? mirrored? in another order?), the lenses, and that nothing but the object is left in the pictures"
+            f"{path}: the cameras contradict one another: of the box around the object in {names[worst]} the other views leave"
+            f" {shares[worst]:.0%} possible, expected nearly 100%. Check the poses (camera to world, axes as in OpenGL? mirrored?"
+            " in another order?), the lenses, and that nothing but the object is left in the pictures"
         )
 
 
@@ -132,8 +138,8 @@ def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:
     return matting.cut_alone(read_rgba(path), str(path), options.background, options.tolerance, options.holes)
 
 
-def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int]]:
-    """Returns the box of the object over all times, and the (width, height) of a view."""
+def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int], bool]:
+    """Returns the box of the object over all times, the (width, height) of a view, and whether it is seen at every time."""
     boxes: list[Box] = []
     sizes: dict[tuple[int, int], Path] = {}
     for time in times:
@@ -147,7 +153,7 @@ def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, t
             boxes.append(box)
     if not boxes:
         raise DataError(f"{view.paths[times[0]].parent}: no object in any frame of a camera (all empty)")
-    return union(boxes), next(iter(sizes))
+    return union(boxes), next(iter(sizes)), len(boxes) == len(times)
 
 
 def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:

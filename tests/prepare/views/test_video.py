@@ -951,6 +951,14 @@ def test_cameras_that_contradict_one_another_are_told(tmp_path, capsys):
     assert "scene: the cameras contradict one another: of the box around the object in r_" in capsys.readouterr().err
 
 
+def test_a_camera_that_the_object_leaves_contradicts_no_other(tmp_path, capsys):
+    folder, _ = blender_folder(tmp_path / "scene")
+    for frame in (0, 2):
+        Image.fromarray(np.zeros((48, 64, 4), np.uint8)).save(folder / f"train/r_1_{frame}.png")
+    transforms_clip(folder, SMALL)
+    assert "contradict" not in capsys.readouterr().err
+
+
 def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
     """World_to_camera, OpenCV axes, of cameras at (azimuth, elevation) held level in a world of z up, which `turn` turns."""
     poses = []
