@@ -28,6 +28,7 @@ _DISTORTION += (*(f"ftheta_p{place}" for place in range(5)), "latlong", "rolling
 _DISTORTION += ("distortion_params", "distortion", "distortion_coefficients", "dist_coeffs", "k", "p")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
+_START = 1 << 16  # bytes of a file in which the first frame stands
 _LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _LONGEST = 1000  # times the width of the picture: no lens for objects is that long
@@ -115,10 +116,17 @@ def _focal(lens: dict[str, float], axis: str, extent: float) -> float:
 
 
 def transforms_files(path: Path) -> list[Path]:
-    """Returns the files of this kind in a folder, or the one that was named; [] where there are none."""
+    """Returns the files of this kind in a folder, or the one that was named, whatever it is called; [] where there are none."""
     if path.is_dir():
         return [path / name for name in FILES if (path / name).is_file()]
-    return [path] if path.name in FILES and path.is_file() else []
+    return [path] if path.is_file() and (path.name in FILES or _lists_poses(path)) else []
+
+
+def _lists_poses(path: Path) -> bool:
+    if path.suffix.lower() != ".json":
+        return False
+    with path.open("rb") as file:
+        return b'"transform_matrix"' in file.read(_START)
 
 
 def read_views(path: Path, *, quiet: bool = False) -> tuple[list[View], list[float]]:
@@ -128,7 +136,7 @@ def read_views(path: Path, *, quiet: bool = False) -> tuple[list[View], list[flo
     """
     views: dict[bytes, View] = {}
     for file in transforms_files(path):
-        _collect(file, FILES[file.name], views)
+        _collect(file, FILES.get(file.name, "train"), views)
     times = {time for view in views.values() for time in view.paths}
     whole = [view for view in views.values() if view.paths.keys() == times]
     if not whole:

@@ -53,6 +53,16 @@ def _check(options: VideoOptions) -> None:
         raise UsageError(
             "--views, --mask and --pattern belong to clips without cameras; transforms_*.json lists all views itself"
         )
+    usual = VideoOptions()
+    if other := [
+        name
+        for name in ("elevation", "radius", "fovy", "border")
+        if not np.isclose(getattr(options, name), getattr(usual, name))
+    ]:
+        raise UsageError(
+            f"--{other[0]} {getattr(options, other[0]):g}: belongs to clips without cameras; transforms_*.json says where its"
+            " cameras stand and what they see, and its pictures are not cropped"
+        )
 
 
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:

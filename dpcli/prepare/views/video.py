@@ -80,6 +80,10 @@ class VideoOptions:
             raise UsageError(f"--holes {self.holes}: expected {', '.join(matting.HOLES)}")
         if self.mask and self.background != "auto":
             raise UsageError("--mask and --background were both given; a mask already says what the object is")
+        if self.border != VideoOptions.border and not self.crops:
+            raise UsageError(
+                f"--border {self.border:g}: belongs to the crop, which --views and --no-recenter leave out"
+            )
         if self.views_cameras and not self.views:
             raise UsageError("--views-cameras describes the cameras of --views FOLDER; give both")
         matting.named_background(self.background)

@@ -453,6 +453,8 @@ def test_keep_takes_the_whole_picture(tmp_path):
     "options",
     [
         {"border": 1.0},
+        {"border": 0.3, "recenter": False},
+        {"border": 0.3, "views": Path("views")},
         {"background": "pink"},
         {"background": "1,2"},
         {"background": "300,0,0"},
@@ -756,7 +758,9 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
     data = json.loads(path.read_text())
     DIALECTS[dialect](data)
     path.write_text(json.dumps(data))
-    for named in (folder, path):
+    (folder / "cameras of mine.json").write_text(path.read_text())
+    for named in (folder, path, folder / "cameras of mine.json"):
+        assert is_transforms(named)
         clip = transforms_clip(named, SMALL)
         np.testing.assert_allclose(clip.header.intrinsics, expected.intrinsics)
         np.testing.assert_allclose(clip.header.world_to_camera, expected.world_to_camera)
@@ -957,6 +961,13 @@ def test_a_camera_that_the_object_leaves_contradicts_no_other(tmp_path, capsys):
         Image.fromarray(np.zeros((48, 64, 4), np.uint8)).save(folder / f"train/r_1_{frame}.png")
     transforms_clip(folder, SMALL)
     assert "contradict" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["elevation", "radius", "fovy", "border"])
+def test_options_of_a_camera_that_is_known_are_wrong_use(tmp_path, option):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=1)
+    with pytest.raises(UsageError, match=f"--{option} 0.7: belongs to clips without cameras"):
+        transforms_clip(folder, VideoOptions(**{option: 0.7}))
 
 
 def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
