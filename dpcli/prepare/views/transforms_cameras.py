@@ -29,6 +29,7 @@ _DISTORTION += ("distortion_params", "distortion", "distortion_coefficients", "d
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
 _START = 1 << 16  # bytes of a file in which the first frame stands
+_NOISE, _MOST = 2e-5, 4000  # of poses that are equal, of their largest number; and so many are compared
 _LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _LONGEST = 1000  # times the width of the picture: no lens for objects is that long
@@ -138,18 +139,39 @@ def read_views(path: Path, *, quiet: bool = False) -> tuple[list[View], list[flo
     for file in transforms_files(path):
         _collect(file, FILES.get(file.name, "train"), views)
     times = {time for view in views.values() for time in view.paths}
-    whole = [view for view in views.values() if view.paths.keys() == times]
+    found = list(views.values())
+    if any(view.paths.keys() != times for view in found) and len(found) <= _MOST:
+        found = _joined(found)
+    whole = [view for view in found if view.paths.keys() == times]
     if not whole:
         raise DataError(
-            f"{path}: the camera moves or zooms ({len(views)} poses and lenses for {len(times)} times); a file of views holds "
+            f"{path}: the camera moves or zooms ({len(found)} poses and lenses for {len(times)} times); a file of views holds "
             "still cameras with a picture at every time\nRender or select at least one camera over all times"
         )
-    if len(whole) < len(views) and not quiet:
+    if len(whole) < len(found) and not quiet:
         log.warn(
-            f"{path}: {len(views) - len(whole)} of {len(views)} cameras without a picture at some of the {len(times)} times; left out"
+            f"{path}: {len(found) - len(whole)} of {len(found)} cameras without a picture at some of the {len(times)} times; left out"
         )
     whole.sort(key=lambda view: view.role != "train")
     return _each_once(path, whole, quiet), sorted(times)
+
+
+def _joined(views: list[View]) -> list[View]:
+    """Returns the views with those joined that are one still camera whose pose was written with noise, such as of float32."""
+    kept: list[View] = []
+    poses = np.empty((len(views), 4, 4))
+    for view in views:
+        apart = np.abs(poses[: len(kept)] - view.pose).max(axis=(1, 2))
+        for near in np.flatnonzero(apart <= _NOISE * max(1.0, np.abs(view.pose).max())):
+            own = kept[near]
+            if (own.role, own.lens) == (view.role, view.lens) and own.paths.keys().isdisjoint(view.paths):
+                own.paths.update(view.paths)
+                own.masks.update(view.masks)
+                break
+        else:
+            poses[len(kept)] = view.pose
+            kept.append(view)
+    return kept
 
 
 def _each_once(path: Path, views: list[View], quiet: bool) -> list[View]:

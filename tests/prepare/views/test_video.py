@@ -970,6 +970,22 @@ def test_options_of_a_camera_that_is_known_are_wrong_use(tmp_path, option):
         transforms_clip(folder, VideoOptions(**{option: 0.7}))
 
 
+@pytest.mark.parametrize("unit", [1, 1000])
+@pytest.mark.parametrize("noise", [0, 1e-7, 3e-6])
+def test_a_still_camera_whose_poses_have_noise_is_one(tmp_path, capsys, noise, unit):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data, rng = json.loads(path.read_text()), np.random.default_rng(0)
+    for frame in data["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] *= unit
+        pose[:3] += noise * rng.uniform(-1, 1, (3, 4)) * [1, 1, 1, unit]
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(data))
+    header = transforms_clip(folder, SMALL).header
+    assert header.num_views == 3 and header.num_frames == 3 and "left out" not in capsys.readouterr().err
+
+
 def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
     """World_to_camera, OpenCV axes, of cameras at (azimuth, elevation) held level in a world of z up, which `turn` turns."""
     poses = []
