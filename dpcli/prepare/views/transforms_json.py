@@ -167,8 +167,8 @@ def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, t
 
 
 def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:
-    """Returns seconds f64 (T) of the files' times: frame numbers where they are whole and pass 1, seconds where they pass 1,
-    else shares of the clip. The log says which.
+    """Returns seconds f64 (T) of the files' times: frame numbers where they are whole and pass 1, in steps of their greatest
+    common divisor; seconds where they pass 1; else shares of the clip. The log says which.
 
     fps: frames per second, of numbers and shares; it goes before the seconds of the files.
     """
@@ -177,8 +177,10 @@ def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:
         return values
     ends = f"{path}: times {times[0]:.10g} to {times[-1]:.10g} are taken for"
     if max(times) > 1 and (values == np.floor(values)).all():
-        log.info(f"{ends} numbers of frames, {rate:g} per second (--fps)")
-        return values / np.gcd.reduce(values.astype(np.int64)) / rate
+        step = int(np.gcd.reduce(values.astype(np.int64)))
+        steps = f" in steps of {step}, {rate:g} steps" if step > 1 else f", {rate:g}"
+        log.info(f"{ends} numbers of frames{steps} per second (--fps)")
+        return values / step / rate
     if max(times) > 1 and not fps:
         log.info(f"{ends} seconds (--fps N: shares of a clip of N frames per second)")
         return values

@@ -774,7 +774,8 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
         ((0, 0.25, 1), None, (0, 0.03125, 0.125), "0 to 1 are taken for shares of a clip of 16 frames per second"),
         ((0, 0.5, 2.5), None, (0, 0.5, 2.5), "0 to 2.5 are taken for seconds"),
         ((0, 0.5, 2.5), 10, (0, 0.04, 0.2), "0 to 2.5 are taken for shares of a clip of 10 frames per second"),
-        ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames, 10 per second"),
+        ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames in steps of 10, 10 steps per"),
+        ((10, 11, 14), 10, (0, 0.1, 0.4), "10 to 14 are taken for numbers of frames, 10 per second"),
         ((1.7e9, 1.7e9 + 0.5, 1.7e9 + 2), None, (0, 0.5, 2), "1700000000 to 1700000002 are taken for seconds"),
     ],
 )
