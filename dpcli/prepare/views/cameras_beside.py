@@ -68,5 +68,9 @@ def _says_nothing(name: str) -> bool:
 
 
 def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_READ)
+    """Returns how a file begins; nothing of one that can't be opened, which only what is converted has to be."""
+    try:
+        with path.open("rb") as file:
+            return file.read(_READ)
+    except OSError:
+        return b""
