@@ -32,20 +32,6 @@ from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
-_CAMERAS = (  # of others, in the folder of the images or in the one above
-    *(
-        "cameras.json",
-        "cameras.txt",
-        "cameras.bin",
-        "poses_bounds.npy",
-        "sparse",
-        "cameras",
-        "camera",
-        "poses",
-        "poses.txt",
-    ),
-    *("transforms.json", "transforms_train.json", "cameras.xml", "cameras.sfm", "cameras.npz", "cameras_sphere.npz"),
-)
 PICTURE_FOLDERS = {
     "ref",
     "rgba",
@@ -170,11 +156,6 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
         log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
-    if not quiet and (cameras := _cameras_beside(folder)):
-        log.warn(
-            f"{folder}: {first_names(cameras)}: not read; the camera of a clip is assumed to stand still; if it moves, the "
-            "object will seem to. Cameras are read from transforms.json, with a time for each frame"
-        )
     refuse_twins(folder, paths, f"choose with --pattern '*{paths[0].suffix}'")
     stems = [path.stem for path in paths]
     numbers = frame_numbers(stems)
@@ -201,16 +182,6 @@ def _held_instead(folder: Path) -> str:
     if not files[0].suffix and is_image_file(files[0]):
         return f"; {files[0].name} is an image without the suffix of one: give each its own"
     return f"; {files[0].name}: {no_video(files[0])}"
-
-
-def _cameras_beside(folder: Path) -> list[str]:
-    """Returns the names of cameras that other programs left in a folder, or in the one above where its name says only that it
-    holds pictures.
-    """
-    places = [folder, folder.resolve().parent] if folder.resolve().name.lower() in PICTURE_FOLDERS else [folder]
-    beside = [name for name in _CAMERAS if any((place / name).exists() for place in places)]
-    exported = sorted(folder.glob("*.xmp"))[:1]  # of RealityCapture, one for each image
-    return [*beside, *(path.name for path in exported if b"xcr:" in path.read_bytes())]
 
 
 def read_rgba(path: Path) -> np.ndarray:

@@ -13,12 +13,14 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS
+from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import frame_numbers, image_paths
 from dpcli.prepare.reader import natural_key, require_folder
 from dpcli.prepare.series import is_hidden
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
+_TOLD = 12  # views named in the log
 _TURN = 6.29  # a whole turn in radians
 _OF_VIEW = re.compile("view|cam|eval", re.IGNORECASE)  # how the name of a view's folder begins
 _KEYS = {"azimuth", "elevation", "radius", "fovy", "role"}
@@ -103,12 +105,12 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
             )
     if by_frame:
         rows = _matching(folder, frame_numbers([one.name for one in inner]), numbers, total)
-        return [[table[row][view] for row in rows] for view in range(views)]
+        places = _places_of_cameras(folder, [path.stem for path in table[rows[0]]], cameras)
+        return [[table[row][place] for row in rows] for place in places]
     if by_view:
-        stems = [[path.stem for path in row] for row in table]
         return [
-            [row[at] for at in _matching(one, frame_numbers(names), numbers, total)]
-            for one, row, names in zip(inner, table, stems, strict=True)
+            [table[k][at] for at in _matching(inner[k], frame_numbers([p.stem for p in table[k]]), numbers, total)]
+            for k in _places_of_cameras(folder, [one.name for one in inner], cameras)
         ]
     found = "/".join(map(str, per_folder))
     without = "" if cameras else "\nOther cameras than STAG4D's six need --views-cameras FILE: " + _EXAMPLE
@@ -116,6 +118,27 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
         f"{folder}: {len(inner)} folders of {found} pictures; expected {len(numbers)} frames of {views} views, "
         f"as FRAME/VIEW.png or VIEW/FRAME.png{without}"
     )
+
+
+def _places_of_cameras(folder: Path, names: Sequence[str], cameras: list[OrbitCamera] | None) -> list[int]:
+    """Returns, for each camera of a list, the position of its view among `names`: in order, or by the azimuths in the names
+    where they are the list's (`az-30`). The log says which is which; a warning, where no numbers in names make the order.
+    """
+    places = list(range(len(names)))
+    if cameras is None:
+        return places
+    listed = [round(float(np.rad2deg(camera.azimuth)), 6) % 360 for camera in cameras]
+    numbers = [re.findall(r"-?\d+", name)[-1:] for name in names]
+    named = [int(one[0]) % 360 for one in numbers if one]
+    if sorted(named) == sorted(listed) and len(set(named)) == len(names):
+        places = [named.index(azimuth) for azimuth in listed]
+    told = first_names([f"{names[k]} at {azimuth:g}" for k, azimuth in zip(places, listed)], _TOLD)
+    said = f"{folder}: its views and the azimuths of the list of cameras, in degrees: {told}"
+    if len(named) == len(names):
+        log.info(said)
+    else:
+        log.warn(f"{said}; taken in the order of their names: number these where that isn't the order of the list")
+    return places
 
 
 def _matching(where: Path, have: list[int], numbers: Sequence[int], total: int) -> list[int]:

@@ -58,7 +58,8 @@ def plain_background(borders: list[np.ndarray], names: list[str], tolerance: flo
         raise DataError(
             f"{names[worst]}: the background is not plain: {shares[worst]:.0%} of the border is "
             f"{_hex(color)}, expected {_PLAIN:.0%}\n"
-            "Give a mask per frame (--mask FOLDER; SAM 2 or rembg make them), RGBA frames, or --background keep"
+            "Give a mask per frame (--mask FOLDER, or mask_path in transforms.json; SAM 2 or rembg make them), RGBA frames, or"
+            " --background keep"
         )
     return color
 

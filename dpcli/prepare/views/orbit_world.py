@@ -156,3 +156,42 @@ def sphere_of_silhouettes(
         )
         radius = max(radius, float(reach * seen[2]))
     return center, radius
+
+
+def shares_of_boxes(
+    intrinsics: np.ndarray, poses: np.ndarray, boxes: list[tuple[int, int, int, int]], sizes: list[tuple[int, int]]
+) -> np.ndarray:
+    """Returns f64 (V): the share of each box's width or height, whichever is less, that the other views leave possible.
+
+    The object lies in every pyramid of a camera and its box (left, top, right, bottom, taken one pixel wider, open where it
+    touches its picture of `sizes` (width, height)) and reaches each side of each box, so with right cameras all are 1. How
+    far the pyramids' common part reaches in a picture is a linear-fractional program, made linear by fixing the depth.
+    """
+    from scipy.optimize import linprog
+
+    seen = intrinsics @ poses[:, :3]
+    planes = []
+    for view, box, size in zip(seen, boxes, sizes, strict=True):
+        planes.append(view[2])
+        for axis in (0, 1):
+            low, high = box[axis], box[axis + 2]
+            if low > 0:
+                planes.append(view[axis] - (low - 1) * view[2])
+            if high < size[axis]:
+                planes.append((high + 1) * view[2] - view[axis])
+    inside = np.array(planes)
+    inside /= np.linalg.norm(inside, axis=1, keepdims=True)
+    bounds = [(None, None)] * 3 + [(0, None)]  # a point, scaled so that its depth is 1, and the scale
+    shares = np.ones(len(seen))
+    for number, (view, box) in enumerate(zip(seen, boxes, strict=True)):
+        for axis in (0, 1):
+            middle, extent = (box[axis] + box[axis + 2]) / 2, box[axis + 2] - box[axis]
+            across = (view[axis] - middle * view[2]) / extent  # -0.5 to 0.5 within the box
+            reach = 0.0
+            for sign in (-1, 1):
+                most = linprog(
+                    -sign * across, A_ub=-inside, b_ub=np.zeros(len(inside)), A_eq=view[2:], b_eq=[1], bounds=bounds
+                )
+                reach += min(-most.fun, 0.5) if most.status == 0 else 0.0 if most.status == 2 else 0.5
+            shares[number] = min(shares[number], max(reach, 0.0))
+    return shares

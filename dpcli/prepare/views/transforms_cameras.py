@@ -28,9 +28,13 @@ _DISTORTION += (*(f"ftheta_p{place}" for place in range(5)), "latlong", "rolling
 _DISTORTION += ("distortion_params", "distortion", "distortion_coefficients", "dist_coeffs", "k", "p")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
+_START = 1 << 16  # bytes of a file in which the first frame stands
+_NOISE, _MOST = 2e-5, 4000  # of poses that are equal, of their largest number; and so many are compared
 _LAST_TIME = 1e10  # in any unit; seconds since 1970 are fewer
 _WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _LONGEST = 1000  # times the width of the picture: no lens for objects is that long
+_OFF_CENTER = 0.2  # of the picture: what a principal point lies off its middle if the camera isn't of this picture
+_DISAGREE = 0.02  # of a focal length: by how much its angle may make another
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
 
@@ -85,6 +89,26 @@ class View:
             )
         return np.array([[fx * across, 0, cx * across], [0, fy * down, cy * down], [0, 0, 1.0]])
 
+    def doubts(self, width: int, height: int) -> dict[str, str]:
+        """Returns what makes a lens doubtful for pictures of this size, by its kind, in words for the log."""
+        found, matrix = {}, self.intrinsics(width, height)
+        for number, (axis, extent) in enumerate((("x", width), ("y", height))):
+            if abs(matrix[number, 2] / extent - 0.5) > _OFF_CENTER:
+                found["center"] = (
+                    f"a principal point at {matrix[0, 2]:.4g}, {matrix[1, 2]:.4g} in pictures of {width}x{height}, far from their"
+                    " middle: right for cut-outs only; of pictures that were resized, w and h must be the size that cx, cy, fl_x"
+                    " belong to"
+                )
+            angle, focal = self.lens.get(f"camera_angle_{axis}"), self.lens.get(f"fl_{axis}")
+            if angle and focal:
+                own = 0.5 * self.lens.get("wh"[number], extent) / float(np.tan(0.5 * angle))
+                if abs(own / focal - 1) > _DISAGREE:
+                    found["angle"] = (
+                        f"fl_{axis} {focal:.4g} is taken, though camera_angle_{axis} {angle:.4g} makes it {own:.4g} pixels; leave"
+                        " out the wrong one"
+                    )
+        return found
+
 
 def _focal(lens: dict[str, float], axis: str, extent: float) -> float:
     """Returns the focal length along an axis in pixels, 0 where the file doesn't say it."""
@@ -93,33 +117,80 @@ def _focal(lens: dict[str, float], axis: str, extent: float) -> float:
 
 
 def transforms_files(path: Path) -> list[Path]:
-    """Returns the files of this kind in a folder, or the one that was named; [] where there are none."""
+    """Returns the files of this kind in a folder, or the one that was named, whatever it is called; [] where there are none."""
     if path.is_dir():
         return [path / name for name in FILES if (path / name).is_file()]
-    return [path] if path.name in FILES and path.is_file() else []
+    return [path] if path.is_file() and (path.name in FILES or _lists_poses(path)) else []
 
 
-def read_views(path: Path) -> tuple[list[View], list[float]]:
+def _lists_poses(path: Path) -> bool:
+    if path.suffix.lower() != ".json":
+        return False
+    with path.open("rb") as file:
+        return b'"transform_matrix"' in file.read(_START)
+
+
+def read_views(path: Path, *, quiet: bool = False) -> tuple[list[View], list[float]]:
     """Returns still cameras that have a picture at every time, training ones first, and the times, rising.
 
-    Raises DataError when there is none, or at what of the files can't be used.
+    quiet: what is left out isn't told. Raises DataError when there is none, or at what of the files can't be used.
     """
     views: dict[bytes, View] = {}
     for file in transforms_files(path):
-        _collect(file, FILES[file.name], views)
+        _collect(file, FILES.get(file.name, "train"), views)
     times = {time for view in views.values() for time in view.paths}
-    whole = [view for view in views.values() if view.paths.keys() == times]
+    found = list(views.values())
+    if any(view.paths.keys() != times for view in found) and len(found) <= _MOST:
+        found = _joined(found)
+    whole = [view for view in found if view.paths.keys() == times]
     if not whole:
         raise DataError(
-            f"{path}: the camera moves or zooms ({len(views)} poses and lenses for {len(times)} times); a file of views holds "
+            f"{path}: the camera moves or zooms ({len(found)} poses and lenses for {len(times)} times); a file of views holds "
             "still cameras with a picture at every time\nRender or select at least one camera over all times"
         )
-    if len(whole) < len(views):
+    if len(whole) < len(found) and not quiet:
         log.warn(
-            f"{path}: {len(views) - len(whole)} of {len(views)} cameras without a picture at some of the {len(times)} times; left out"
+            f"{path}: {len(found) - len(whole)} of {len(found)} cameras without a picture at some of the {len(times)} times; left out"
         )
     whole.sort(key=lambda view: view.role != "train")
-    return whole, sorted(times)
+    return _each_once(path, whole, quiet), sorted(times)
+
+
+def _joined(views: list[View]) -> list[View]:
+    """Returns the views with those joined that are one still camera whose pose was written with noise, such as of float32."""
+    kept: list[View] = []
+    poses = np.empty((len(views), 4, 4))
+    for view in views:
+        apart = np.abs(poses[: len(kept)] - view.pose).max(axis=(1, 2))
+        for near in np.flatnonzero(apart <= _NOISE * max(1.0, np.abs(view.pose).max())):
+            own = kept[near]
+            if (own.role, own.lens) == (view.role, view.lens) and own.paths.keys().isdisjoint(view.paths):
+                own.paths.update(view.paths)
+                own.masks.update(view.masks)
+                break
+        else:
+            poses[len(kept)] = view.pose
+            kept.append(view)
+    return kept
+
+
+def _each_once(path: Path, views: list[View], quiet: bool) -> list[View]:
+    """Returns the views without those whose pictures another one has, too: a list of all pictures beside one of the tests.
+
+    They are for testing, unless that leaves none to train on, as where the list of training is copied to please a loader.
+    """
+    shown = {
+        role: {p for view in views if view.role == role for p in view.paths.values()} for role in ("train", "test")
+    }
+    both = shown["train"] & shown["test"]
+    left = "test" if shown["train"] <= shown["test"] else "train"
+    kept = [view for view in views if view.role != left or both.isdisjoint(view.paths.values())]
+    if len(kept) < len(views) and not quiet:
+        log.warn(
+            f"{path}: {len(views) - len(kept)} of {len(views)} cameras listed for training and for testing; taken for"
+            f" {'testing' if left == 'train' else 'training'} alone"
+        )
+    return kept
 
 
 def named_up(path: Path) -> np.ndarray | None:

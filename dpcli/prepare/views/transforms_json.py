@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.masks import read_mask
-from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes, up_of_cameras
+from dpcli.prepare.views.orbit_world import into_orbit, shares_of_boxes, sphere_of_silhouettes, up_of_cameras
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
 from dpcli.prepare.views.transforms_cameras import View, named_up, read_views, transforms_files
 from dpcli.prepare.views.video import VideoOptions, spread_frames
@@ -23,16 +24,18 @@ from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
 
+_SHARED = 0.95  # of a box around the object, at least, is possible where all cameras are right
+
 
 def is_transforms(path: Path) -> bool:
     """Returns whether a path is a folder of this kind, or a file of its cameras."""
     return bool(transforms_files(path))
 
 
-def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
-    """Returns options and digests of everything read, for provenance."""
+def transforms_config(path: Path, options: VideoOptions, *, quiet: bool = True) -> dict[str, Any]:
+    """Returns options and digests of everything read, for provenance; quiet: what is left out isn't told."""
     _check(options)
-    views, times = read_views(path)
+    views, times = read_views(path, quiet=quiet)
     config = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -50,6 +53,16 @@ def _check(options: VideoOptions) -> None:
         raise UsageError(
             "--views, --mask and --pattern belong to clips without cameras; transforms_*.json lists all views itself"
         )
+    usual = VideoOptions()
+    if other := [
+        name
+        for name in ("elevation", "radius", "fovy", "border")
+        if not np.isclose(getattr(options, name), getattr(usual, name))
+    ]:
+        raise UsageError(
+            f"--{other[0]} {getattr(options, other[0]):g}: belongs to clips without cameras; transforms_*.json says where its"
+            " cameras stand and what they see, and its pictures are not cropped"
+        )
 
 
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:
@@ -63,7 +76,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     views, times = read_views(path)
     seconds, chosen = _seconds(path, times, options.fps), spread_frames(len(times), options.frames)
     times = [times[index] for index in chosen]
-    boxes, sizes = zip(*(_look(view, times, options) for view in views))
+    boxes, sizes, always = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([view.intrinsics(*size) for view, size in zip(views, sizes, strict=True)])
     if any(high > wide and view.has_angle_across_alone for view, (wide, high) in zip(views, sizes)):
         log.warn(
@@ -77,6 +90,17 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
     poses = np.stack([world.pose(pose) for pose in poses])
+    doubts = [view.doubts(*size) for view, size in zip(views, sizes, strict=True)]
+    for kind in {kind: None for one in doubts for kind in one}:
+        said = [one[kind] for one in doubts if kind in one]
+        log.warn(f"{path}: {counted(len(said), 'camera')}: {said[0]}")
+    if asked := [
+        k for k in range(len(views)) if always[k]
+    ]:  # where it is out of sight at times, its box isn't all of its way
+        names = [next(iter(views[k].paths.values())).name for k in asked]
+        _tell_contradiction(
+            path, names, intrinsics[asked], poses[asked], [boxes[k] for k in asked], [sizes[k] for k in asked]
+        )
     crops = [whole_picture(*size) for size in sizes]
     header = ViewsHeader(
         options.name or (path if path.is_dir() else path.parent).resolve().name,
@@ -98,6 +122,25 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     return Clip(header, pictures)
 
 
+def _tell_contradiction(
+    path: Path,
+    names: list[str],
+    intrinsics: np.ndarray,
+    poses: np.ndarray,
+    boxes: list[Box],
+    sizes: list[tuple[int, int]],
+) -> None:
+    """Warns of cameras that can't all be those of the boxes around the object; names: of a picture of each."""
+    shares = shares_of_boxes(intrinsics, poses, boxes, sizes)
+    if shares.min() < _SHARED:
+        worst = int(shares.argmin())
+        log.warn(
+            f"{path}: the cameras contradict one another: of the box around the object in {names[worst]} the other views leave"
+            f" {shares[worst]:.0%} possible, expected nearly 100%. Check the poses (camera to world, axes as in OpenGL? mirrored?"
+            " in another order?), the lenses, and that nothing but the object is left in the pictures"
+        )
+
+
 def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:
     path, mask = view.paths[time], view.masks.get(time)
     if mask:
@@ -105,8 +148,8 @@ def _cut(view: View, time: float, options: VideoOptions) -> np.ndarray:
     return matting.cut_alone(read_rgba(path), str(path), options.background, options.tolerance, options.holes)
 
 
-def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int]]:
-    """Returns the box of the object over all times, and the (width, height) of a view."""
+def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int], bool]:
+    """Returns the box of the object over all times, the (width, height) of a view, and whether it is seen at every time."""
     boxes: list[Box] = []
     sizes: dict[tuple[int, int], Path] = {}
     for time in times:
@@ -120,12 +163,12 @@ def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, t
             boxes.append(box)
     if not boxes:
         raise DataError(f"{view.paths[times[0]].parent}: no object in any frame of a camera (all empty)")
-    return union(boxes), next(iter(sizes))
+    return union(boxes), next(iter(sizes)), len(boxes) == len(times)
 
 
 def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:
-    """Returns seconds f64 (T) of the files' times: frame numbers where they are whole and pass 1, seconds where they pass 1,
-    else shares of the clip. The log says which.
+    """Returns seconds f64 (T) of the files' times: frame numbers where they are whole and pass 1, in steps of their greatest
+    common divisor; seconds where they pass 1; else shares of the clip. The log says which.
 
     fps: frames per second, of numbers and shares; it goes before the seconds of the files.
     """
@@ -134,8 +177,10 @@ def _seconds(path: Path, times: list[float], fps: float | None) -> np.ndarray:
         return values
     ends = f"{path}: times {times[0]:.10g} to {times[-1]:.10g} are taken for"
     if max(times) > 1 and (values == np.floor(values)).all():
-        log.info(f"{ends} numbers of frames, {rate:g} per second (--fps)")
-        return values / np.gcd.reduce(values.astype(np.int64)) / rate
+        step = int(np.gcd.reduce(values.astype(np.int64)))
+        steps = f" in steps of {step}, {rate:g} steps" if step > 1 else f", {rate:g}"
+        log.info(f"{ends} numbers of frames{steps} per second (--fps)")
+        return values / step / rate
     if max(times) > 1 and not fps:
         log.info(f"{ends} seconds (--fps N: shares of a clip of N frames per second)")
         return values

@@ -26,6 +26,7 @@ from dpcli.prepare.decode.color_frames import (
 )
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
+from dpcli.prepare.views.cameras_beside import tell_cameras_beside
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
 from dpcli.prepare.views.masks import mask_of_video, read_mask
 from dpcli.prepare.views.square_crop import Crop, crop_around, pieces, touches_border, union, visible_box, whole_picture
@@ -79,6 +80,10 @@ class VideoOptions:
             raise UsageError(f"--holes {self.holes}: expected {', '.join(matting.HOLES)}")
         if self.mask and self.background != "auto":
             raise UsageError("--mask and --background were both given; a mask already says what the object is")
+        if self.border != VideoOptions.border and not self.crops:
+            raise UsageError(
+                f"--border {self.border:g}: belongs to the crop, which --views and --no-recenter leave out"
+            )
         if self.views_cameras and not self.views:
             raise UsageError("--views-cameras describes the cameras of --views FOLDER; give both")
         matting.named_background(self.background)
@@ -100,6 +105,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     """
     options.check()
     frames = open_frames(path, options.pattern)
+    tell_cameras_beside(path, options.views_cameras)
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]

@@ -105,7 +105,7 @@ class ClipIndex:
         Raises DataError when masks or views lack frames.
         """
         if is_transforms(self.clip):
-            transforms_config(self.clip, self.options)  # finds every picture that the lists name
+            transforms_config(self.clip, self.options, quiet=False)  # finds every picture that the lists name
             return [Item(clip_name(self.clip), self.clip)]
         frames = open_frames(self.clip, self.options.pattern)
         if self.options.mask:

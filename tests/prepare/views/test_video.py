@@ -19,7 +19,7 @@ from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import read_cameras
-from dpcli.prepare.views.orbit_world import up_of_cameras
+from dpcli.prepare.views.orbit_world import shares_of_boxes, up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
@@ -453,6 +453,8 @@ def test_keep_takes_the_whole_picture(tmp_path):
     "options",
     [
         {"border": 1.0},
+        {"border": 0.3, "recenter": False},
+        {"border": 0.3, "views": Path("views")},
         {"background": "pink"},
         {"background": "1,2"},
         {"background": "300,0,0"},
@@ -506,6 +508,40 @@ def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
     assert clip.header.role == ["reference", "train", "test"]
     assert orbit_of(clip.header.world_to_camera[1])[2] == pytest.approx(3)
     np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
+
+
+@pytest.mark.parametrize("by_frame", [False, True])
+@pytest.mark.parametrize(
+    ("names", "azimuths", "order", "told"),
+    [
+        (
+            ["az-90", "az-30", "az30", "az150"],
+            [-90, -30, 30, 150],
+            [0, 1, 2, 3],
+            "az-90 at 270, az-30 at 330, az30 at 30",
+        ),
+        (["r_330", "r_0", "r_90"], [330, 0, 90], [0, 1, 2], "r_330 at 330, r_0 at 0, r_90 at 90"),
+        (["cam2", "cam10", "cam1"], [20, 100, 10], [2, 0, 1], "cam1 at 20, cam2 at 100, cam10 at 10"),
+        (
+            ["front", "left", "back"],
+            [0, 90, 180],
+            [2, 0, 1],
+            "back at 0, front at 90, left at 180; taken in the order of",
+        ),
+    ],
+)
+def test_views_belong_to_the_cameras_that_their_names_say(tmp_path, capsys, by_frame, names, azimuths, order, told):
+    """A sign or words in names make another order than the list's, which is noticed, or told."""
+    clip = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(2)])
+    for number, name in enumerate(names):
+        for frame in range(2):
+            place = tmp_path / "v" / (f"frame{frame}/{name}.png" if by_frame else f"{name}/{frame}.png")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(disc((24, 24), 8, color=(200, 40 + 40 * number, 30))).save(place)
+    (tmp_path / "c.json").write_text(json.dumps([{"azimuth": a, "elevation": 0} for a in azimuths]))
+    found = read(video_clip(clip, VideoOptions(size=64, views=tmp_path / "v", views_cameras=tmp_path / "c.json")))
+    seen = [round((int(found[view, 1][32, 24, 1]) - 40) / 40) for view in range(1, len(names) + 1)]
+    assert seen == order and told in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("recenter", [False, True])
@@ -722,7 +758,9 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
     data = json.loads(path.read_text())
     DIALECTS[dialect](data)
     path.write_text(json.dumps(data))
-    for named in (folder, path):
+    (folder / "cameras of mine.json").write_text(path.read_text())
+    for named in (folder, path, folder / "cameras of mine.json"):
+        assert is_transforms(named)
         clip = transforms_clip(named, SMALL)
         np.testing.assert_allclose(clip.header.intrinsics, expected.intrinsics)
         np.testing.assert_allclose(clip.header.world_to_camera, expected.world_to_camera)
@@ -736,7 +774,8 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
         ((0, 0.25, 1), None, (0, 0.03125, 0.125), "0 to 1 are taken for shares of a clip of 16 frames per second"),
         ((0, 0.5, 2.5), None, (0, 0.5, 2.5), "0 to 2.5 are taken for seconds"),
         ((0, 0.5, 2.5), 10, (0, 0.04, 0.2), "0 to 2.5 are taken for shares of a clip of 10 frames per second"),
-        ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames, 10 per second"),
+        ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames in steps of 10, 10 steps per"),
+        ((10, 11, 14), 10, (0, 0.1, 0.4), "10 to 14 are taken for numbers of frames, 10 per second"),
         ((1.7e9, 1.7e9 + 0.5, 1.7e9 + 2), None, (0, 0.5, 2), "1700000000 to 1700000002 are taken for seconds"),
     ],
 )
@@ -803,6 +842,149 @@ def test_bad_transforms(tmp_path, change, message):
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
         transforms_clip(folder, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({}, ""),
+        ({"fl_x": FOCAL, "camera_angle_y": 2 * np.arctan(24 / FOCAL)}, ""),
+        ({"fl_x": 1.1 * FOCAL}, "3 cameras: fl_x 96.43 is taken, though camera_angle_x 0.7 makes it 87.66 pixels"),
+        ({"fl_y": FOCAL, "camera_angle_y": 0.7}, "fl_y 87.66 is taken, though camera_angle_y 0.7 makes it 65.75"),
+        (
+            {"fl_x": 2 * FOCAL, "cx": 64, "cy": 48},
+            "a principal point at 64, 48 in pictures of 64x48, far from their middle",
+        ),
+        ({"cx": 64, "cy": 48, "w": 128, "h": 96}, ""),
+    ],
+)
+def test_a_lens_that_can_hardly_be_that_of_its_pictures_is_told(tmp_path, capsys, change, told):
+    """Pictures that were made smaller beside the camera of the large ones, and numbers of one lens that disagree."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    transforms_clip(folder, SMALL)
+    said = capsys.readouterr().err
+    assert told in said and ("warning" in said) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ("listed", "tested", "roles"),
+    [
+        ((0, 1, 2), (2,), ["reference", "train", "test"]),
+        ((0, 1, 2), (0,), ["reference", "train", "test"]),
+        ((0, 1), (0, 1), ["reference", "train"]),
+        ((0, 1), (0, 1, 2), ["reference", "train", "test"]),
+        ((0, 1), (2,), ["reference", "train", "test"]),
+    ],
+)
+def test_a_camera_listed_for_training_and_for_testing_is_of_one_of_them(tmp_path, capsys, listed, tested, roles):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for name, cameras in (("transforms_train.json", listed), ("transforms_test.json", tested)):
+        frames = [data["frames"][3 * camera + frame] for camera in cameras for frame in range(3)]
+        (folder / name).write_text(json.dumps({**data, "frames": frames}))
+    assert transforms_clip(folder, SMALL).header.role == roles
+    twice = len(set(listed) & set(tested))
+    assert capsys.readouterr().err.count(f"{twice} of {len(listed) + len(tested)} cameras listed for training") == bool(
+        twice
+    )
+
+
+def test_cameras_left_out_are_told_once(tmp_path, capfd):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "frames": data["frames"][:-1]}))
+    assert exit_code("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32") == 0
+    assert capfd.readouterr().err.count("1 of 3 cameras without a picture at some of the 3 times") == 1
+
+
+def seen_points(seed: int, views: int) -> tuple[np.ndarray, np.ndarray, list, list]:
+    """Lenses, poses, and the exact boxes of points about the origin in pictures of 320x240, cut at their borders."""
+    rng = np.random.default_rng(seed)
+    points = np.c_[rng.normal(0, 0.3, (30, 3)) * rng.uniform(0.4, 1.6, 3), np.ones(30)]
+    poses = np.stack([orbit_pose(*rng.uniform((0, -0.3), (6.3, 1)), rng.uniform(2, 4)) for _ in range(views)])
+    poses[:, :2, 3] += rng.normal(0, 0.15, (views, 2))
+    lenses = np.array(
+        [
+            [[f, 0, x], [0, g, y], [0, 0, 1]]
+            for f, g, x, y in rng.uniform((250, 250, 140, 100), (400, 400, 180, 140), (views, 4))
+        ]
+    )
+    boxes = []
+    for lens, pose in zip(lenses, poses):
+        pixels = points @ (lens @ pose[:3]).T
+        pixels = np.clip(pixels[:, :2] / pixels[:, 2:], 0, (320, 240))
+        boxes.append((*pixels.min(0), *pixels.max(0)))
+    return lenses, poses, boxes, [(320, 240)] * views
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_right_cameras_leave_all_of_every_box_possible(seed, views):
+    shares = shares_of_boxes(*seen_points(seed, views))
+    assert shares.shape == (views,) and shares.min() > 1 - 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("wrong", ["inverted", "lens of larger pictures", "exchanged", "mirrored"])
+def test_wrong_cameras_leave_less(seed, wrong):
+    lenses, poses, boxes, sizes = seen_points(seed, 8)
+    if wrong == "inverted":
+        poses = np.linalg.inv(poses)
+    elif wrong == "exchanged":
+        poses = poses[[1, 0, *range(2, 8)]]
+    elif wrong == "mirrored":
+        poses = np.diag([1, -1, 1, 1.0]) @ poses @ np.diag([1, -1, 1, 1.0])
+    else:
+        lenses = lenses * np.array([2, 2, 1])[:, None]
+    assert shares_of_boxes(lenses, poses, boxes, sizes).min() < 0.95
+
+
+def test_cameras_that_contradict_one_another_are_told(tmp_path, capsys):
+    """World to camera in place of camera to world, of cameras that don't look at the world's origin."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += (0.5, 1, 0)
+        frame["transform_matrix"] = np.linalg.inv(pose).tolist()
+    path.write_text(json.dumps(data))
+    transforms_clip(folder, SMALL)
+    assert "scene: the cameras contradict one another: of the box around the object in r_" in capsys.readouterr().err
+
+
+def test_a_camera_that_the_object_leaves_contradicts_no_other(tmp_path, capsys):
+    folder, _ = blender_folder(tmp_path / "scene")
+    for frame in (0, 2):
+        Image.fromarray(np.zeros((48, 64, 4), np.uint8)).save(folder / f"train/r_1_{frame}.png")
+    transforms_clip(folder, SMALL)
+    assert "contradict" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["elevation", "radius", "fovy", "border"])
+def test_options_of_a_camera_that_is_known_are_wrong_use(tmp_path, option):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=1)
+    with pytest.raises(UsageError, match=f"--{option} 0.7: belongs to clips without cameras"):
+        transforms_clip(folder, VideoOptions(**{option: 0.7}))
+
+
+@pytest.mark.parametrize("unit", [1, 1000])
+@pytest.mark.parametrize("noise", [0, 1e-7, 3e-6])
+def test_a_still_camera_whose_poses_have_noise_is_one(tmp_path, capsys, noise, unit):
+    folder, _ = blender_folder(tmp_path / "scene")
+    path = folder / "transforms_train.json"
+    data, rng = json.loads(path.read_text()), np.random.default_rng(0)
+    for frame in data["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] *= unit
+        pose[:3] += noise * rng.uniform(-1, 1, (3, 4)) * [1, 1, 1, unit]
+        frame["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(data))
+    header = transforms_clip(folder, SMALL).header
+    assert header.num_views == 3 and header.num_frames == 3 and "left out" not in capsys.readouterr().err
 
 
 def level_cameras(angles: list[tuple[float, float]], turn: np.ndarray) -> np.ndarray:
@@ -958,13 +1140,54 @@ def test_what_is_left_out_is_told_once(tmp_path, capfd, other, pattern):
     assert capfd.readouterr().err.count("left out") == 1
 
 
-@pytest.mark.parametrize("beside", ["sparse", "../transforms.json", "../cameras", "0.xmp", "edits.xmp", "../../sparse"])
-def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(tmp_path, capfd, beside):
-    folder = save(tmp_path / "scene" / "images", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
-    (folder / beside).write_text('<x:xmpmeta xcr:Position="1"/>' if beside == "0.xmp" else "<x:xmpmeta/>")
-    open_frames(folder)
-    said = "images: " + beside.rpartition("/")[2] + ": not read; the camera of a clip is assumed to stand still"
-    assert (said in capfd.readouterr().err) == (beside not in ("edits.xmp", "../../sparse"))
+@pytest.mark.parametrize(
+    ("folder", "beside", "words", "told"),
+    [
+        ("scene/images", "sparse", "", True),
+        ("scene/images", "../transforms.json", "", True),
+        ("scene/images", "../cameras", "", True),
+        ("scene/images", "../../sparse", "", False),
+        ("scene/images", "0.xmp", '<x:xmpmeta xcr:Position="1"/>', True),
+        ("scene/images", "edits.xmp", "<x:xmpmeta/>", False),
+        ("scene/images_4", "../poses_bounds.npy", "", True),
+        ("scene/rgb/1x", "../../camera", "", True),
+        ("scene/images/01", "../../intri.yml", "", True),
+        ("scene/train", "../transforms_train.json", "", True),
+        ("scene/Camera_B1", "../annots.npy", "", True),
+        ("scene/Camera_B1", "../cameras.json", "", False),
+        ("scene/rgb", "../metadata.json", '{"w": 1440, "poses": [[0, 0, 0, 1, 0, 0, 0]]}', True),
+        ("scene/rgb", "../metadata.json", '{"title": "a fox"}', False),
+        ("scene/7", "0.pose.txt", "1 0 0 0", True),
+        ("scene/scan", "0.json", '{"cameraPoseARFrame": [1, 0]}', True),
+        ("scene/scan", "0.json", '{"shapes": []}', False),
+    ],
+)
+def test_cameras_of_other_programs_are_told_in_the_folder_and_above_one_of_pictures(
+    tmp_path, capfd, folder, beside, words, told
+):
+    place = save(tmp_path / folder, [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (place / beside).write_text(words)
+    name = beside.rpartition("/")[2]
+    said = f"{place.name}: {name}: not read; the camera of a clip is assumed to stand still"
+    video_clip(place, SMALL)
+    assert (said in capfd.readouterr().err) == told
+    open_frames(place)  # as masks are
+    assert "assumed" not in capfd.readouterr().err
+
+
+def test_a_list_of_cameras_that_is_read_is_not_told_as_unread(tmp_path, capfd):
+    place = save(tmp_path / "rgba", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    views = save(tmp_path / "views" / "view0", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png").parent
+    (tmp_path / "cameras.json").write_text('[{"azimuth": 90, "elevation": 0}]')
+    video_clip(place, VideoOptions(size=64, views=views, views_cameras=tmp_path / "cameras.json"))
+    assert "not read" not in capfd.readouterr().err
+
+
+def test_cameras_beside_a_video_are_told(tmp_path, capfd):
+    path = uneven_video(tmp_path / "rgb.mp4")
+    (tmp_path / "camera_matrix.csv").write_text("1,0,0")
+    video_clip(path, VideoOptions(size=64, background="keep"))
+    assert "rgb.mp4: camera_matrix.csv: not read" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
