@@ -94,9 +94,8 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     for kind in {kind: None for one in doubts for kind in one}:
         said = [one[kind] for one in doubts if kind in one]
         log.warn(f"{path}: {counted(len(said), 'camera')}: {said[0]}")
-    if asked := [
-        k for k in range(len(views)) if always[k]
-    ]:  # where it is out of sight at times, its box isn't all of its way
+    # where it is out of sight at times, its box isn't all of its way
+    if asked := [k for k in range(len(views)) if always[k]]:
         names = [next(iter(views[k].paths.values())).name for k in asked]
         _tell_contradiction(
             path, names, intrinsics[asked], poses[asked], [boxes[k] for k in asked], [sizes[k] for k in asked]
