@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 from dpcli.errors import DataError
 
@@ -97,6 +98,15 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
     return None
 
 
+def axes_in(names: Sequence[str]) -> list[str]:
+    """Returns the names of x, y and z among others, [] where none or several could be these, which reading says."""
+    try:
+        places, _ = find_axes(names) or ([], "")
+    except DataError:
+        return []
+    return [names[place] for place in places]
+
+
 def unit_of(name: str) -> str:
     """Returns the unit that a name ends with, as in `store.schema.METERS`, "" where it says none."""
     words = words_of(name)
@@ -125,6 +135,24 @@ def unit_of_comments(lines: Iterable[str]) -> str:
     found = [_TOLD.search(line) or _IN_WORDS.search(line) for line in lines]
     told = {_SPELLED.get(match[1].lower(), "") for match in found if match} - {""}
     return told.pop() if len(told) == 1 else ""
+
+
+def unit_of_attributes(path: Path, names: Iterable[str], told: Mapping[str, str]) -> str:
+    """Returns the unit that attributes of some columns tell, else that of their whole table; "" where they tell none.
+
+    names: of the columns that hold coordinates. told: what is said of columns by name, and of the table by "". Raises DataError
+    where columns differ.
+
+    >>> unit_of_attributes(Path("a"), "xyz", {"": "m", "t": "ms", "x": "mm", "y": "mm"})
+    'mm'
+    """
+    for some in (names, [""]):
+        if units := {unit_of_comments([f"units: {told.get(name, '')}"]) for name in some} - {""}:
+            try:
+                return one_unit(units)
+            except DataError as error:
+                raise DataError(f"{path}: {error}") from None
+    return ""
 
 
 def one_unit(units: set[str]) -> str:
