@@ -115,6 +115,21 @@ def test_tables_of_single_clouds_are_read_by_the_names_of_their_columns(tmp_path
     assert np.array_equal(sample.points, np.concatenate([expected, expected]))
 
 
+@pytest.mark.parametrize(
+    ("units", "meters"), [("1e-3 m", 1e-3), ("0.01 m", 1e-2), ("in", 0.0254), ("\u00b5m", 1e-6), ("m/s", 1)]
+)
+def test_units_are_read_as_netcdf_may_write_them(tmp_path, units, meters):
+    """With a factor before them, and with a letter beyond ASCII; a speed is no length."""
+    points = RNG.normal(size=(4, 50, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = points
+        file["points"].attrs["units"] = units
+    run = told("prepare", "clouds", tmp_path / "a.h5", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert not run.returncode, run.stderr
+    with CloudsReader(tmp_path / "out.h5") as reader:
+        assert np.allclose(reader.read(0).points.reshape(points.shape), points * meters, atol=0, rtol=1e-5)
+
+
 @pytest.mark.parametrize("form", ["points", "x y z", "table"])
 def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form):
     points = RNG.normal(size=(50, 3)) * 100
