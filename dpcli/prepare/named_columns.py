@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickletools
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,13 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables, told_units
-from dpcli.prepare.cloud_formats.column_names import find_axes, find_frame_column, find_trios, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import (
+    axes_in,
+    find_axes,
+    find_frame_column,
+    find_trios,
+    unit_of_attributes,
+)
 from dpcli.prepare.scans.times_of_tables import seconds_of
 
 Columns = dict[str, np.ndarray]
@@ -24,7 +29,9 @@ Columns = dict[str, np.ndarray]
 class ArrayTable:
     """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
-    by_name: the columns as stored. Raises DataError where the file holds none, or several.
+    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "".
+
+    Raises DataError where the file holds no table, or several, or x, y and z in different units.
     """
 
     cut: Mapping[str, int] = {}  # numbers that no text holds have all their digits
@@ -37,14 +44,9 @@ class ArrayTable:
                 f"{path}: holds {told}; expected one: write it as .csv or .parquet (pandas: DataFrame.to_csv)"
             )
         self.path = path
-        ((self.by_name, self._units),) = found.values()
+        ((self.by_name, self.units),) = found.values()
         self.names = tuple(self.by_name)
-        axes: list[int] = []
-        with suppress(DataError):  # reading says which names could be the same
-            axes, _ = find_axes(self.names) or (axes, "")
-        about = [self._units.get(name, "") for name in ("", *(self.names[place] for place in axes))]
-        units = {unit_of_comments([f"units: {told}"]) for told in about} - {""}
-        self.unit = units.pop() if len(units) == 1 else ""
+        self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
@@ -71,7 +73,7 @@ class ArrayTable:
             known = ~np.isnat(since)
             first = since[known][0] if known.any() else since[0]
             return np.where(known, (since - first) / np.timedelta64(1, "s"), np.nan)
-        told = self._units.get(name, "").split()[:1]
+        told = self.units.get(name, "").split()[:1]
         unit = seconds_of(f"t [{told[0]}]", column[:1]) if told and column.dtype.kind in "uif" and len(column) else 0.0
         column = column.astype(np.int64) if column.dtype.kind in "ui" else column  # whose differences don't wrap around
         return (column - column[0]).astype(np.float64) * unit if unit else None

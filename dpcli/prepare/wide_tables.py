@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
-from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, one_unit, unit_of, words_of
+from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, one_unit, unit_of, unit_of_attributes, words_of
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, delimiter_of, names_in, seconds_by_name
 from dpcli.prepare.named_columns import ArrayTable
@@ -121,6 +121,8 @@ def _checked(path: Path, table: TextTable | ParquetTable | ArrayTable, told: lis
     if isinstance(table, TextTable) and not table.first_rows(1):
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
     own = one_unit({unit_of(table.names[place]) for trio in trios for place in trio})
+    if not isinstance(table, TextTable):
+        unit = unit_of_attributes(path, [table.names[place] for trio in trios for place in trio], table.units)
     return WideTable(table, np.array(trios), own or unit)
 
 

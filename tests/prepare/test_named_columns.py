@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from importlib import import_module
 
 import h5py
 import numpy as np
@@ -114,6 +115,21 @@ def test_tables_of_single_clouds_are_read_by_the_names_of_their_columns(tmp_path
     assert np.array_equal(sample.points, np.concatenate([expected, expected]))
 
 
+@pytest.mark.parametrize(
+    ("units", "meters"), [("1e-3 m", 1e-3), ("0.01 m", 1e-2), ("in", 0.0254), ("\u00b5m", 1e-6), ("m/s", 1)]
+)
+def test_units_are_read_as_netcdf_may_write_them(tmp_path, units, meters):
+    """With a factor before them, and with a letter beyond ASCII; a speed is no length."""
+    points = RNG.normal(size=(4, 50, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = points
+        file["points"].attrs["units"] = units
+    run = told("prepare", "clouds", tmp_path / "a.h5", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert not run.returncode, run.stderr
+    with CloudsReader(tmp_path / "out.h5") as reader:
+        assert np.allclose(reader.read(0).points.reshape(points.shape), points * meters, atol=0, rtol=1e-5)
+
+
 @pytest.mark.parametrize("form", ["points", "x y z", "table"])
 def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form):
     points = RNG.normal(size=(50, 3)) * 100
@@ -164,6 +180,57 @@ def test_units_of_columns_count(tmp_path):
     reader = TableSequences(tmp_path / "a.h5")
     sample = reader.read(reader.items()[0], np.random.default_rng(0)).sequence
     assert np.allclose(sample.points[:, 1], COLUMNS["y"] / 1000) and np.allclose(sample.time, np.arange(FRAMES) * 0.1)
+
+
+def test_units_of_columns_that_differ_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in COLUMNS.items():
+            file[name] = values
+        for name, unit in zip("xyz", ("mm", "mm", "m")):
+            file[name].attrs["units"] = unit
+    run = told("prepare", "clouds", tmp_path / "a.h5", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert run.returncode == 3 and "different units (m, mm)" in run.stderr
+
+
+@pytest.mark.parametrize("place", ["columns", "table"])
+@pytest.mark.parametrize("form", ["h5", "parquet", "feather"])
+@pytest.mark.parametrize("wide", [False, True])
+def test_units_beside_columns_count_in_every_form_of_table(tmp_path, form, wide, place):
+    """As attributes of HDF5 and metadata of Arrow's fields and schemas tell them: places in millimeters, times in milliseconds."""
+    coordinates = [f"{part}_{axis}" for part in "ab" for axis in "xyz"] if wide else list("xyz")
+    columns = {"frame": np.arange(4), "time": np.arange(4) * 40} | {name: np.arange(4) + 0.5 for name in coordinates}
+    units = {"time": "ms", **dict.fromkeys(coordinates[:-1], "mm")}
+    units = units if place == "columns" else {"time": "ms"}
+    path = tmp_path / f"a.{form}"
+    if form == "h5":
+        with h5py.File(path, "w") as file:
+            if place == "table":
+                file["log"] = np.rec.fromarrays(list(columns.values()), names=list(columns))
+                file["log"].attrs["units"] = "mm"
+            else:
+                for name, one in columns.items():
+                    file[name] = one
+                    file[name].attrs["units"] = units.get(name, "")
+    else:
+        arrow = pytest.importorskip("pyarrow")
+        fields = [
+            arrow.field(
+                name, arrow.from_numpy_dtype(one.dtype), metadata={"units": units[name]} if name in units else {}
+            )
+            for name, one in columns.items()
+        ]
+        schema = arrow.schema(fields, metadata={"unit": "mm"} if place == "table" else {})
+        table = arrow.table([arrow.array(one) for one in columns.values()], schema=schema)
+        write = import_module(f"pyarrow.{form}")
+        (write.write_table if form == "parquet" else write.write_feather)(table, path)
+    track = ("--track", "columns") if wide else ()
+    words = ("prepare", "clouds", path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
+    assert not told(*words, *track).returncode
+    with CloudsReader(tmp_path / "out.h5") as reader:
+        sample = reader.read(0)
+    assert np.allclose(sample.points[:: 2 if wide else 1, 2], (np.arange(4) + 0.5) / 1000)
+    if (form, place) != ("h5", "table"):
+        assert np.allclose(sample.time, np.arange(4) * 0.04)
 
 
 @pytest.mark.parametrize("kind", ["u2", "i2", "u4", "u8"])

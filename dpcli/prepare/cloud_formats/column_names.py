@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 from dpcli.errors import DataError
 
@@ -38,14 +39,17 @@ _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height"
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")
 _TOLD = re.compile(
-    r"(?:\b|_)(?:units?|coordinates|lengths)\b(?:\s*[:=]\s*|\s+(?:are\s+|is\s+)?(?:in\s+)?)(?:1\s+)?[\[(]?([a-z]+)\b",
+    r"(?:\b|_)(?:units?|coordinates|lengths)\b(?:\s*[:=]\s*|\s+(?:are\s+|is\s+)?)(?:in\s+)?"
+    r"(?:(?P<size>\d*\.?\d+(?:e-?\d+)?|10\^-?\d+)\s+)?[\[(]?(?P<unit>[a-z]+)\b(?!\s*/)",
     re.IGNORECASE,
 )
 _IN_WORDS = re.compile(  # "x, y, z in mm", but no "resolution in mm"
     r"^[^a-z]*(?:(?:comment|obj_info|all|the|values|points?|positions?|vertices|vertex|data|are|is|given|stored|measured|x|y|z|xyz"
-    r"|and)\b[^a-z]*)+\bin\s+[\[(]?([a-z]+)\b",
+    r"|and)\b[^a-z]*)+\bin\s+[\[(]?(?P<unit>[a-z]+)\b(?!\s*/)",
     re.IGNORECASE,
 )
+_METERS = {1e-6: "um", 1e-3: "mm", 1e-2: "cm", 1e-1: "dm", 1.0: "m", 1e3: "km"}  # as netCDF writes them: 1e-3 m
+_MICRO = re.compile("[\u00b5\u03bc]")  # two letters look like a micro sign
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
 _FRAME = re.compile(
     r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq|#|№)?[.]?",
@@ -68,7 +72,7 @@ def words_of(name: str) -> list[str]:
     >>> words_of("x [µm]"), words_of("Höhe")  # a letter beyond ASCII ends no word: "m" alone would be meters
     (['x', 'um'], ['höhe'])
     """
-    plain = re.sub("[\u00b5\u03bc]", "u", name)  # two letters look like a micro sign
+    plain = _MICRO.sub("u", name)
     plain = re.sub(r"""[\[(]("|''|\u2033)[\])]""", "(inch)", plain)
     return [word.lower() for word in _WORD.findall(plain)]
 
@@ -97,6 +101,15 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
     return None
 
 
+def axes_in(names: Sequence[str]) -> list[str]:
+    """Returns the names of x, y and z among others, [] where none or several could be these, which reading says."""
+    try:
+        places, _ = find_axes(names) or ([], "")
+    except DataError:
+        return []
+    return [names[place] for place in places]
+
+
 def unit_of(name: str) -> str:
     """Returns the unit that a name ends with, as in `store.schema.METERS`, "" where it says none."""
     words = words_of(name)
@@ -121,10 +134,39 @@ def unit_of_comments(lines: Iterable[str]) -> str:
     ('mm', '')
     >>> unit_of_comments(["comment x, y, z in mm"]), unit_of_comments(["comment accuracy of points in mm"])
     ('mm', '')
+    >>> unit_of_comments(["units: 1e-3 m"]), unit_of_comments(["units: 0.01 m"]), unit_of_comments(["units: 7 m"])
+    ('mm', 'cm', '')
+    >>> unit_of_comments(["units: \u00b5m"]), unit_of_comments(["units: in"]), unit_of_comments(["units: m/s"])
+    ('um', 'in', '')
     """
-    found = [_TOLD.search(line) or _IN_WORDS.search(line) for line in lines]
-    told = {_SPELLED.get(match[1].lower(), "") for match in found if match} - {""}
+    plain = [_MICRO.sub("u", line) for line in lines]
+    found = [_TOLD.search(line) or _IN_WORDS.search(line) for line in plain]
+    told = {_unit_of_match(**match.groupdict()) for match in found if match} - {""}
     return told.pop() if len(told) == 1 else ""
+
+
+def _unit_of_match(unit: str, size: str | None = None) -> str:
+    known = (_SPELLED | {"in": "in"}).get(unit.lower(), "")  # where no other word follows
+    number = float((size or "1").lower().replace("10^", "1e"))
+    return known if number == 1 else _METERS.get(number, "") if known == "m" else ""
+
+
+def unit_of_attributes(path: Path, names: Iterable[str], told: Mapping[str, str]) -> str:
+    """Returns the unit that attributes of some columns tell, else that of their whole table; "" where they tell none.
+
+    names: of the columns that hold coordinates. told: what is said of columns by name, and of the table by "". Raises DataError
+    where columns differ.
+
+    >>> unit_of_attributes(Path("a"), "xyz", {"": "m", "t": "ms", "x": "mm", "y": "mm"})
+    'mm'
+    """
+    for some in (names, [""]):
+        if units := {unit_of_comments([f"units: {told.get(name, '')}"]) for name in some} - {""}:
+            try:
+                return one_unit(units)
+            except DataError as error:
+                raise DataError(f"{path}: {error}") from None
+    return ""
 
 
 def one_unit(units: set[str]) -> str:

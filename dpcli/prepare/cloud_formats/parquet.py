@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,13 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, reading
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import find_axes
+from dpcli.prepare.cloud_formats.column_names import (
+    axes_in,
+    find_axes,
+    seconds_in_brackets,
+    unit_of_attributes,
+    words_of,
+)
 
 COLUMNAR = (".parquet", ".feather", ".arrow")
 _CELL = 8  # bytes of a number
@@ -38,9 +44,10 @@ def is_pose_table(path: Path) -> bool:
 
 
 class ParquetTable:
-    """Offers a Parquet or Feather file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words."""
+    """Offers a Parquet or Feather file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
-    unit = ""  # of the coordinates, which no comments tell here
+    units: what the metadata of its schema say of those of some columns, and of the whole table by "".
+    """
 
     def __init__(self, path: Path) -> None:
         try:
@@ -63,6 +70,10 @@ class ParquetTable:
                 raise DataError(f"{path}: not a readable {kind} table, perhaps truncated ({said})") from None
         self._table = self._table.flatten()  # a column of structures becomes one for each of their fields
         self.names = tuple(self._table.column_names)
+        schema = self._table.schema
+        told = {field.name: _told_units(field.metadata) for field in schema} | {"": _told_units(schema.metadata)}
+        self.units = {name: units for name, units in told.items() if units}
+        self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
@@ -94,13 +105,19 @@ class ParquetTable:
         return {}
 
     def moments(self, place: int) -> np.ndarray | None:
-        """Returns the seconds f64 (N) since the first of a column of times or durations, NaN where it is empty; None of other
-        types.
+        """Returns the seconds f64 (N) since the first of a column of times or durations, or of numbers in what the metadata call a
+        unit of time, NaN where it is empty; None of others.
         """
         import pyarrow.types as types
 
         column = self._table.column(place)
         parts = _parts_of_second(column.type)
+        told = self.units.get(self.names[place], "").split()[:1]
+        numbers = types.is_integer(column.type) or types.is_floating(column.type)
+        if numbers and told and (unit := seconds_in_brackets(" ".join(words_of(told[0])))):
+            values = self.columns([place])[:, 0]
+            known = values[np.isfinite(values)]
+            return (values - known[0]) * unit if len(known) else None
         if not parts:
             return None
         kind = "int32" if column.type.bit_width == 32 else "int64"
@@ -110,6 +127,11 @@ class ParquetTable:
         counted = (whole.fill_null(first).to_numpy() - first) / parts
         counted = past_midnight(counted) if types.is_time(column.type) else counted
         return np.where(column.is_valid().to_numpy(), counted, np.nan)
+
+
+def _told_units(metadata: Mapping[bytes, bytes] | None) -> str:
+    about = metadata or {}
+    return about.get(b"units", about.get(b"unit", b"")).decode("utf-8", "replace")
 
 
 def past_midnight(seconds: np.ndarray) -> np.ndarray:

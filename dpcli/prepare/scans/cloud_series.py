@@ -31,16 +31,17 @@ _OF_POINTS = re.compile(  # folders whose arrays tell more of the points that li
 _LOOKED_AT = 20, 1000  # lines of a text that may hold poses; of so many points some lie at edges
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .xlsx .xls .ods"
-    " .pcap .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
+    " .pcap .pcapng .osf .svo .svo2 .lvx .lvx2 .vtk .vtp .vtu .msh .wrl .x3d .pkl .pt .pth .tfrecord"
     " .ksplat .sog .oni .klg .rrd .vrs .nc .zarr"
     " .usd .usda .usdc .abc .blend .3ds"
-    " .jsonl .ndjson"
-    " .c3d .bvh .asf .amc .skeleton"
+    " .jsonl .ndjson .msgpack .avro .orc .rds .rdata .3mf .dxf .pnts .zfs"
+    " .c3d .bvh .asf .amc .skeleton .sto .mot"
     " .bag .mcap .db3 .active .bz2 .xz .zst .tar .tgz".split()
 )
 _MARKERS = ".trc"  # tables of markers, which are read only where that is asked for
 _NOTES = (".json", ".yaml", ".yml", ".xml", ".toml")  # that may tell poses, times or labels
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".avi", ".mp4", ".mkv", ".mov")
+_WIDE = "give --track columns"
 _TABLE = "write a table with a row for each frame and columns such as hip_x, hip_y, hip_z, and give --track columns"
 _LINES = "write a table with a row for each point and columns frame, x, y and z"
 _ANIMATED = "save their frames as .obj with the same vertices, or export glTF 2.0, which `dpc prepare animation` reads"
@@ -55,7 +56,10 @@ _ADVICE = {
     _MARKERS: "give --track columns",
     ".c3d": "export them as .trc or .csv, and give --track columns",
     **dict.fromkeys((".bvh", ".asf", ".amc"), f"they hold angles of joints: compute where these are, and {_TABLE}"),
-    **dict.fromkeys((".jsonl", ".ndjson"), _LINES),
+    **dict.fromkeys((".sto", ".mot"), f"where their columns are places, call them .txt, and {_WIDE}"),
+    **dict.fromkeys((".jsonl", ".ndjson", ".msgpack"), _LINES),
+    **dict.fromkeys((".avro", ".orc"), "write them as .parquet"),
+    **dict.fromkeys((".rds", ".rdata"), "write their tables as .csv"),
     ".json": f"if they hold joints, {_TABLE}; if points, {_LINES}",
     ".skeleton": f"if they hold joints, {_TABLE}",
     **dict.fromkeys((".abc", ".usd", ".usda", ".usdc", ".usdz", ".blend", ".fbx"), _ANIMATED),
@@ -138,9 +142,10 @@ def _without_logs(root: Path, found: list[Series], poses: list[Series], alone: l
 
 
 def refuse_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Raises DataError where a path is one file, a cloud or of a format that is not read, and says what to do with it."""
+    """Raises DataError where a path is one file or store, a cloud or of a format that is not read, and says what to do with it."""
     suffix = path.suffix.lower()
-    if suffix in (*_FOREIGN, ".json") and suffix not in (_MARKERS, *MESHES) and path.is_file():
+    whole = path.is_file() or (path.is_dir() and stores([path.name]))
+    if suffix in (*_FOREIGN, ".json") and suffix not in (_MARKERS, *MESHES) and whole:
         advice = _advice([suffix])
         end = "" if "--track" in advice else ", and name their folder or table"
         raise DataError(f"{path}: {suffix} files are not read: {advice}{end}")

@@ -162,11 +162,18 @@ def test_formats_of_motion_capture_are_told_what_to_do(tmp_path: Path) -> None:
         "walk.bvh": "they hold angles of joints: compute where these are",
         "000_keypoints.json": "if they hold joints, write a table with a row for each frame",
         "scans.jsonl": "write a table with a row for each point and columns frame, x, y and z",
+        "walk.sto": "call them .txt, and give --track columns",
+        "walk.avro": "write them as .parquet",
+        "walk.zarr": "save their arrays as .npy",
         "walk.trc": "give --track columns",
     }.items():
         folder = tmp_path / name.replace(".", "_")
         folder.mkdir()
-        (folder / name).write_text("x\n")
+        if name == "walk.zarr":
+            (folder / name).mkdir()
+            (folder / name / "zarr.json").write_text("{}\n")
+        else:
+            (folder / name).write_text("x\n")
         for raw in (folder, folder / name)[: 1 if name == "walk.trc" else 2]:
             said = told("prepare", "clouds", raw, "-o", tmp_path / "out.h5")
             assert said.returncode == 3 and advice in " ".join(said.stderr.split())
