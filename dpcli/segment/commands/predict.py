@@ -39,6 +39,8 @@ from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _ROWS = 8  # sequences in a picture
+_FLOW_BYTES, _MOTION_BYTES = 12, 64  # of a point's flow, of a part's motion, between two frames
+_MUCH = 10**9  # bytes for one sequence: far more than a sequence itself takes
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,10 @@ def predict_file(
         still = [reader.names[i] for i in sequences if reader.frame_counts[i] < 2]
         if still and settings.classical.method == "multibody":
             log.warn(f"{data}: one frame shows no motion: all is one part in {first_names(still)}")
+        if settings.classical.method == "multibody" and not (segmenter.by_tracks and "track" in reader.fields):
+            _tell_of_thinning(reader, sequences, refinement.points)
+        if refinement.pairs == "all":
+            _tell_of_many_pairs(reader, sequences, segmenter.slots)
         if force or not already_made(target, entry, PartsReader, WORK):
             if settings.classical.method == "scene":
                 for line in taken_for_meters(reader.path, reader.length_unit):
@@ -139,6 +145,36 @@ def predict_file(
             ) as writer:
                 _predict_sequences(reader, sequences, work, writer, fields, spread, settings.classical)
         return _close(target, drawings, settings.classical.method == "scene")
+
+
+def _tell_of_thinning(reader: CloudsReader, sequences: list[int], points: int) -> None:
+    """Says how many points of a frame are looked at where frames have more and nobody said how many to take."""
+    chosen = np.isin(np.repeat(np.arange(len(reader)), reader.frame_counts), sequences)
+    most = int(reader.frame_sizes[chosen].max(initial=0))
+    if points == Refinement.points and most > points:
+        log.info(
+            f"{reader.path}: {points} of up to {most:,} points of a frame are looked at, and parts that have few of them may be"
+            f" missed; --points {min(4 * points, most)} shows smaller ones and takes longer"
+        )
+
+
+def _tell_of_many_pairs(reader: CloudsReader, sequences: list[int], slots: int) -> None:
+    """Warns where the flows and motions between all pairs of a sequence's frames take more memory and disk than is expected."""
+    from rich.filesize import decimal
+
+    bytes_of = {}
+    for index in sequences:
+        others = max(int(reader.frame_counts[index]) - 1, 0)
+        of_frames = reader.frame_counts[index] * slots * _MOTION_BYTES
+        bytes_of[index] = others * int(reader.point_counts[index] * _FLOW_BYTES + of_frames)
+    if bytes_of and max(bytes_of.values()) > _MUCH:
+        large = max(bytes_of, key=bytes_of.__getitem__)
+        frames, most = int(reader.frame_counts[large]), bytes_of[large]
+        log.warn(
+            f"{reader.path}: --pairs all: the flows and motions of the {frames * (frames - 1):,} pairs of frames of"
+            f" {reader.names[large]} take {decimal(most)} of memory, and of all sequences {decimal(sum(bytes_of.values()))} of the"
+            f" disk; with --pairs adjacent {decimal(most // frames)} of memory"
+        )
 
 
 def _record(settings: PredictSettings, refinement: Refinement) -> dict[str, Any]:

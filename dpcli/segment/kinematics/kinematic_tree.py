@@ -67,7 +67,7 @@ def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
         points_at_start(sequence, int(part), trajectories.motion[:, k]) for k, part in enumerate(trajectories.ids)
     ]
     spacing = _spacing(points)
-    known = _registrations(sequence, trajectories, spacing)
+    known = _registrations(sequence, trajectories, spacing) if len(points) > 1 else []
     directions = [surface_directions(cloud) for cloud in points]
     sizes = np.array([len(cloud) for cloud in points])
     count = len(points)

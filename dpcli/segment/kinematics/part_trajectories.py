@@ -35,11 +35,11 @@ def part_trajectories(sequence: CloudSequence, said: PartsSample) -> Trajectorie
     """Returns one motion from frame 0 for each part and frame that fits the motions of all pairs, both ways.
 
     Motions are averaged over the pairs that lead to a frame, again and again (chordal means, projected to rotations), from
-    a start along the fewest pairs. Raises DataError for a single frame, and where a frame is reached by no pair.
+    a start along the fewest pairs. Raises DataError for several parts in a single frame, and where a frame is reached by no pair.
     """
-    if sequence.num_frames < 2:
-        raise DataError(f"{sequence.name!r}: one frame only, which shows no motion; joints need two or more")
     ids = np.unique(sequence.part[sequence.part >= 0])
+    if sequence.num_frames < 2 and len(ids) > 1:
+        raise DataError(f"{sequence.name!r}: one frame only, which shows no motion; joints need two or more")
     counts = np.array([[(part == k).sum() for k in ids] for part in _frames_of(sequence.part, sequence)])
     edges = [(int(i), int(j), m[ids].astype(np.float64)) for (i, j), m in zip(said.pairs, said.motion, strict=True)]
     edges += [(j, i, np.linalg.inv(motion)) for i, j, motion in edges]

@@ -9,6 +9,7 @@ from dpcli.segment.flow.surface_icp import Surface
 _COSINE = np.cos(np.radians(12))  # of the normals that make one direction
 _NORMALS = 3  # directions of normals of a part
 _FEWEST = 9  # points that make a surface
+_MOST, _AT_ONCE = 8192, 2048  # points of a part whose normals are counted, and of them those that count at once
 _ACROSS = 0.3  # least sine between two normals whose cross product is a direction
 _ALIKE = np.cos(np.radians(10))  # of directions that count as one
 _ANGLES = np.radians(np.arange(90))  # of a rectangle's edges that are tried
@@ -22,13 +23,13 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
     """
     if len(points) < _FEWEST:
         return np.zeros((0, 3))
+    points = _thinned(points)
     centered = points - points.mean(0)
     normals = Surface(centered / max(float(np.abs(centered).max()), 1e-9)).normals.astype(np.float64)
     found: list[np.ndarray] = []
     left = normals
     while len(found) < _NORMALS and len(left) >= _FEWEST:
-        votes = (np.abs(left @ normals.T) > _COSINE).sum(1)
-        found.append(_mean_direction(normals, left[votes.argmax()]))
+        found.append(_mean_direction(normals, left[_alike(left, normals).argmax()]))
         left = left[np.abs(left @ found[-1]) <= _COSINE]
     crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
     found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
@@ -37,6 +38,7 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
 
 def directions_and_edges(points: np.ndarray) -> np.ndarray:
     """Returns the part's surface directions, and the edges of a plate across the most frequent, f64 (D,3)."""
+    points = _thinned(points)
     found = surface_directions(points)
     return np.concatenate([found, _plate_edges(points - points.mean(0), found[0])]) if len(found) else found
 
@@ -52,6 +54,16 @@ def distinct_directions(directions: np.ndarray) -> np.ndarray:
         if not chosen or (np.abs(directions[chosen] @ direction) <= _ALIKE).all():
             chosen.append(k)
     return directions[chosen]
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    return points if len(points) <= _MOST else points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
+
+
+def _alike(some: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns for each of some unit vectors (m,3) how many of the normals (n,3), of either sign, lie along it; never m x n at once."""
+    parts = (some[start : start + _AT_ONCE] for start in range(0, len(some), _AT_ONCE))
+    return np.concatenate([(np.abs(part @ normals.T) > _COSINE).sum(1) for part in parts])
 
 
 def _plate_edges(centered: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from dpcli.segment.commands.joints import find_joints
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.segment.rigid_motions import move
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsWriter
-from dpcli.store.joints import VALUE
+from dpcli.store.joints import PARENT, VALUE
 from tests.support.commands import exit_code, piped
 from tests.support.drawers import drawer, predicted
 
@@ -321,6 +321,23 @@ def test_one_frame_has_no_joints(tmp_path):
         writer.write(cloud, np.eye(3, dtype=np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 3, 4, 4)), [])
     with pytest.raises(DataError, match="'still': one frame only, which shows no motion"):
         find_joints(str(tmp_path / "p.h5"), tmp_path / "p.json", sequence=None, picture=None, force=False)
+
+
+def test_a_sequence_of_one_frame_and_one_part_has_no_joints_and_leaves_the_others_theirs(few, tmp_path):
+    """`segment predict` makes one part of a single frame, with a warning."""
+    with PartsReader(few) as reader:
+        some, said, parts = reader.read(0), reader.read_parts(0), reader.num_parts
+        still = CloudSequence.from_frames("still", [some.frame(0)], part=[np.zeros(len(some.frame(0)), np.int16)])
+        share = np.eye(parts, dtype=np.float32)[still.part]
+        with PartsWriter(tmp_path / "p.h5", num_parts=parts, class_names=[], length_unit="m") as writer:
+            writer.write(still, share, np.zeros((0, 2), np.int32), np.zeros((0, parts, 4, 4)), [])
+            writer.write(some, said.probability, said.pairs, said.motion, said.flow)
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.json", sequence=None, picture=None, force=False)
+    one, other = json.loads((tmp_path / "j.json").read_text())
+    assert one["name"] == "still" and len(one["parts"]) == 1 and one["joints"] == [] and other["joints"]
+    find_joints(str(tmp_path / "p.h5"), tmp_path / "j.h5", sequence=None, picture=None, force=False)
+    with PartsReader(tmp_path / "j.h5") as reader:
+        assert (reader.read(0).joint[..., PARENT] == -1).all()
 
 
 def test_a_folder_that_could_not_be_filled_is_not_left(few, tmp_path, monkeypatch):

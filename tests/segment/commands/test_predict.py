@@ -226,3 +226,37 @@ def test_settings_of_tracks_and_of_the_search_are_told_apart(dpc_here, tmp_path)
     words = ("--set", "flexible=0.1", "--set", "border=0.1", "--set", "most_bodies=3")
     done = dpc_here(*predict, tmp_path / "c1.h5", "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 0 and b"warning: border: not read where points have tracks" in done.stderr
+
+
+def test_flows_of_all_pairs_that_take_much_memory_are_told_before_the_work(dpc_here, tmp_path, monkeypatch):
+    from dpcli.segment.commands import predict as commands
+
+    rng, frames, points = np.random.default_rng(0), 5, 40
+    with CloudsWriter(tmp_path / "c.h5", class_names=[]) as writer:
+        writer.write(CloudSequence.from_frames("long", [rng.random((points, 3), np.float32)] * frames))
+    words = ("segment", "predict", tmp_path / "c.h5", "-o", tmp_path / "p.h5", "--method", "ward", "--flow", "nearest")
+    told = f"the flows and motions of the {frames * (frames - 1)} pairs of frames of long"
+    assert told not in dpc_here(*words, "--pairs", "all").stderr.decode()
+    with PartsReader(tmp_path / "p.h5") as reader:
+        sample = reader.read_parts(0)
+        made = sum(map(np.size, sample.flow)) * 4 + sample.motion.size * 4
+    monkeypatch.setattr(commands, "_MUCH", made - 1)
+    assert told in dpc_here(*words, "--pairs", "all", "--force").stderr.decode()
+    monkeypatch.setattr(commands, "_MUCH", made)
+    assert told not in dpc_here(*words, "--pairs", "all", "--force").stderr.decode()
+
+
+def test_frames_of_more_points_than_are_looked_at_are_told(dpc_here, tmp_path):
+    rng = np.random.default_rng(0)
+    for name, sizes in (("few.h5", (40, 512)), ("many.h5", (40, 700))):
+        with CloudsWriter(tmp_path / name, class_names=[]) as writer:
+            writer.write(CloudSequence.from_frames("a", [rng.random((size, 3), np.float32) for size in sizes]))
+
+    def said(name: str, *words: str) -> str:
+        done = dpc_here("segment", "predict", tmp_path / name, "-o", tmp_path / "p.h5", "--force", *words)
+        assert done.returncode == 0
+        return done.stderr.decode()
+
+    assert "512 of up to 700 points of a frame are looked at" in said("many.h5")
+    assert "are looked at" not in said("many.h5", "--points", "600")
+    assert "are looked at" not in said("few.h5")

@@ -253,3 +253,17 @@ def test_how_surely_motions_are_known_is_the_same_in_any_place_pose_and_unit():
     unsure = np.diag(np.repeat([1, 4 * np.concatenate(clouds).var(0).sum()], 3))
     np.testing.assert_allclose(found[1], unsure)
     assert np.diagonal(found[[0, 2]], axis1=1, axis2=2).max() < 0.01
+
+
+def test_directions_of_a_dense_part_are_those_of_a_thin_one_and_need_no_memory_by_its_square():
+    """A part of a scan has 100,000 points and more over all frames; their normals beside one another would take 100 GB."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (120_000, 3))
+    side = rng.integers(0, 3, len(points))
+    points[np.arange(len(points)), side] = np.sign(points[np.arange(len(points)), side]) / 2
+    dense = directions_and_edges(points * [1, 0.6, 0.3])
+    thin = directions_and_edges(points[:2000] * [1, 0.6, 0.3])
+    for axis in np.eye(3):
+        assert np.abs(dense @ axis).max() > np.cos(np.radians(0.5)) and np.abs(thin @ axis).max() > np.cos(
+            np.radians(2)
+        )
