@@ -5,7 +5,7 @@ Each choice is a field of a dataclass: `network/config.py`, `training/schedule.p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -83,6 +83,48 @@ def training_settings(given: Given, base: Mapping[str, Any] | None = None) -> Tr
     return TrainingSettings(**TRAINING.resolve(base or PRESETS[given.preset or ""], Given(config=values)))
 
 
+def about_unread(settings: TrainingSettings, typed: Collection[str]) -> list[str]:
+    """Returns a sentence for each setting of the command line, by public name, that changes nothing beside the others."""
+    reasons: dict[str, str] = {}
+    for applies, names, why in _unread_rules(settings):
+        for name in sorted(set(names) & set(typed)) if applies else ():
+            reasons.setdefault(name, why)
+    return [f"{name} changes nothing: {why}; leave it out" for name, why in reasons.items()]
+
+
+def _unread_rules(settings: TrainingSettings) -> list[tuple[bool, Collection[str], str]]:
+    """Returns whether a rule applies, the settings that are then unread, and why. A user's own backbone reads what it likes."""
+    network, schedule, change, run = settings.network, settings.schedule, settings.augmentation, settings.run
+    slots, graph = network.backbone == "slots", network.backbone in BACKBONE_CHANGES
+    return [
+        (slots, set(_PUBLIC[KinetConfig].values()) - _READ_BY_SLOTS, "the backbone slots doesn't read it"),
+        (slots, ("drop_short", "augment_still"), "a clip of the backbone slots is a whole video"),
+        (graph, ("centroids", "radius"), f"{network.backbone} takes the nearest neighbors of every point"),
+        (
+            graph and network.grouping == "first",
+            ("grouping",),
+            f"{network.backbone} takes the nearest neighbors, or balanced ones",
+        ),
+        (not slots and network.solver == "ridge", ("guard",), "solver = ridge needs no guard"),
+        (not slots and not network.normals, ("solver", "guard", "weighting"), "normals = false fits no surfaces"),
+        (not slots and network.merge == "cross", ("merge_norm",), "merge = cross has no batch norm"),
+        (run.pretrain, ("temporal_radius",), "clips of pretrain have one frame"),
+        (
+            run.timing == "clips",
+            ("augment_crop",),
+            "clips of consecutive frames are never all of a video (--timing uniform)",
+        ),
+        (not change.scale, ("augment_per_axis",), "augment_scale = 0"),
+        (
+            not (change.scale or change.turn or change.tilt or change.warp),
+            ("augment_origin",),
+            "no augmentation scales or turns",
+        ),
+        (not schedule.epochs_dynamic, ("lr_dynamic", "draws"), "there is no dynamic stage"),
+        (run.validation == "none", ("validate_every", "validation_clips"), "no video validates"),
+    ]
+
+
 def with_classes(settings: TrainingSettings, classes: int) -> TrainingSettings:
     """Returns the settings with a network for so many classes."""
     return replace(settings, network=settings.network.changed(num_classes=classes))
@@ -131,3 +173,4 @@ _IMPLIED = {
     "normals": {"weighting"},
     "augment": set(_PUBLIC[Augmentation].values()),
 }
+_READ_BY_SLOTS = {"frames", "points", "backbone", "widths", "dropout", "members", "copies", "slot_details"}

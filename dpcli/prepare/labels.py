@@ -139,6 +139,7 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
     if all(map(_is_number, words)):
         class_names = [str(k) for k in range(_plausible(path, records) + 1)]
         labels = {int(word) for word in words}
+        _warn_of_one_number(path, words)
     elif any(map(_is_number, words)):
         raise DataError(f"{path}: some labels are numbers and some are words; use one kind")
     else:
@@ -158,6 +159,19 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         rows[name] = Row(label, int(subject), split_called(split) or split)
     warn_of_splits(path, (row.split for row in rows.values()))
     return LabelTable(path, rows, class_names)
+
+
+def _warn_of_one_number(path: Path, words: Iterable[str]) -> None:
+    """Warns where labels are spelled differently but are one number, such as 1 and 01, which folders of classes tell apart."""
+    spellings: dict[int, list[str]] = {}
+    for word in sorted(words):
+        spellings.setdefault(int(word), []).append(word)
+    for number, alike in sorted(spellings.items()):
+        if len(alike) > 1:
+            log.warn(
+                f"{path}: labels {' and '.join(map(repr, alike))} are one number, so one class, {number}; if they are different classes,"
+                " write words"
+            )
 
 
 def _people(subjects: Iterable[str]) -> dict[str, str]:

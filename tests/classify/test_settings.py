@@ -7,11 +7,15 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
+from dpcli.classify.data.clips import normalize
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.kinet import Kinet, fuse
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES
-from dpcli.classify.settings import TRAINING, network_config, training_settings
+from dpcli.classify.settings import TRAINING, about_unread, network_config, training_settings
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 
@@ -132,3 +136,94 @@ def test_the_settings_of_weights_files_stay_as_they_were():
     assert {"num_frames", "points_per_frame", "radii", "weighting"} <= names
     config = KinetConfig(widths=((8, 8), (8, 16), (16, 32)), head=(8, 9), radii=(0.1, 0.3))
     assert KinetConfig.from_json(config.to_json()) == config
+
+
+SMALL = {"frames": 4, "points": 24, "neighbors": 9}
+POINTS = {**SMALL, "radius": (0.9, 1.8), "centroids": (16, 8), "widths": ((8, 8), (8, 16), (16, 16))}
+GRAPH = {**SMALL, "backbone": "dgcnn", "widths": ((8, 8), (16,), (8, 8, 8, 8, 8), (16, 16)), "head": (8, 16)}
+SPIDER = {**GRAPH, "backbone": "spidercnn", "widths": ((8, 8), (3,), (16, 16))}
+CHANGES = {
+    "normalize": "unit",
+    "centroids": (12, 6),
+    "neighbors": 10,
+    "radius": (0.3, 0.6),
+    "temporal_radius": 0,
+    "grouping": "nearest",
+    "head": (8, 24),
+    "group_size": 4,
+    "reduction": 0.3,
+    "xyz_group": False,
+    "time_input": True,
+    "weighting": "projection",
+    "normals": False,
+    "merge": "cross",
+    "merge_norm": False,
+    "solver": "inverse",
+    "guard": "release",
+    "fusion": "logits",
+}
+# weights that nothing reads, but other draws of all; a guard acts on singular fits alone; a merge that is refused
+OTHER = [("no normals", "weighting"), ("inverse", "guard"), ("dgcnn", "merge"), ("spidercnn", "merge")]
+BASES = {
+    "pointnet2": POINTS,
+    "no normals": {**POINTS, "normals": False},
+    "cross": {**POINTS, "merge": "cross"},
+    "inverse": {**POINTS, "solver": "inverse"},
+    "dgcnn": GRAPH,
+    "spidercnn": SPIDER,
+}
+
+
+def answer(network: KinetConfig) -> list[np.ndarray]:
+    """The shapes of a new network's weights, and its scores of one clip that is normalized as it asks."""
+    rng = np.random.default_rng(0)
+    clip = rng.normal(size=(1, network.num_frames, network.points_per_frame, 3)).astype(np.float32) * 0.4 + 1
+    torch.manual_seed(0)
+    model = Kinet(network).eval()
+    shapes = [np.array(value.shape) for value in model.state_dict().values()]
+    with torch.no_grad():
+        static, dynamic = model(torch.from_numpy(normalize(clip[0], network.normalize))[None])
+        return [*shapes, *(found.numpy() for found in (static, dynamic, fuse(static, dynamic, network.fusion)))]
+
+
+@pytest.mark.parametrize(
+    ("base", "name"), [(base, name) for base in BASES for name in CHANGES if (base, name) not in OTHER]
+)
+def test_a_setting_is_told_where_it_changes_nothing(base, name):
+    """That of a setting which isn't told changes the weights, or what they say of a clip."""
+    base = BASES[base]
+    if CHANGES[name] == getattr(settings(**base).network, TRAINING.settings[name].field):
+        pytest.skip("the same value")
+    before, after = settings(**base), settings(**{**base, name: CHANGES[name]})
+    one, other = answer(before.network), answer(after.network)
+    same = len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other))
+    told = about_unread(after, [name])
+    assert same == bool(told), told
+    assert not same or told[0].startswith(f"{name} changes nothing: ")
+
+
+@pytest.mark.parametrize(
+    ("typed", "unread"),
+    [
+        ({"augment_crop": 0.4}, True),
+        ({"augment_crop": 0.4, "timing": "uniform"}, False),
+        ({"augment": "none", "augment_origin": True}, True),
+        ({"augment": "none", "augment_per_axis": False}, True),
+        ({"augment": "none", "augment_scale": 0.1, "augment_per_axis": False}, False),
+        ({"epochs_dynamic": 0, "lr_dynamic": 0.1}, True),
+        ({"epochs_dynamic": 0, "draws": 2}, True),
+        ({"draws": 2}, False),
+        ({"validation": "none", "validation_clips": 2}, True),
+        ({"validation": "none", "validate_every": 2}, True),
+        ({"pretrain": True, "temporal_radius": 2}, True),
+        ({"backbone": "my:Own", "radius": (1.0, 2.0), "centroids": (16, 8)}, False),
+    ],
+)
+def test_what_else_changes_nothing_is_told(typed, unread):
+    assert bool(about_unread(settings(**typed), typed)) == unread
+
+
+def test_a_network_for_sparse_clouds_says_what_it_does_not_read():
+    typed = {"normalize": "height", "solver": "ridge", "drop_short": True, "augment_still": 0.1, "augment_crop": 0.2}
+    told = about_unread(settings("sparse", **typed), typed)
+    assert [line.split()[0] for line in told] == ["normalize", "solver", "augment_still", "drop_short"]

@@ -167,3 +167,12 @@ def test_splits_between_one_folder_and_the_classes_are_told(tmp_path, capsys):
     assert "all samples are of one class, 'data'" in capsys.readouterr().err
     labels_of_folders(tmp_path, [f"wave/{split}/{one}" for split in ("train", "test") for one in "ab"], "CLASS/VIDEO")
     assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("labels", "told"), [(("1", "01", "2"), True), (("01", "02", "03"), False)])
+def test_one_number_in_two_spellings_is_told(labels, told, tmp_path, capsys):
+    table = tmp_path / "labels.csv"
+    table.write_text("name,label\n" + "".join(f"v{row},{label}\n" for row, label in enumerate(labels)))
+    rows = read_labels(table).rows
+    assert [row.label for row in rows.values()] == list(map(int, labels))
+    assert ("labels '01' and '1' are one number, so one class, 1" in capsys.readouterr().err) == told

@@ -35,7 +35,7 @@ from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.presets import PRESETS
-from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
+from dpcli.classify.settings import TrainingSettings, about_unread, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.fine_tune import resolved, settings_from
 from dpcli.classify.training.first_weights import take_weights
@@ -106,6 +106,8 @@ def train(
     chosen = choose_device(device)
     with input_file(data) as path, process_group(chosen) as processes:
         settings = _chosen_settings(given, CloudsReader(path))
+        for sentence in about_unread(settings, {**given.sets, **given.flags}):
+            log.warn(sentence)
         settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
 

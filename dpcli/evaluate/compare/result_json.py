@@ -84,7 +84,7 @@ def runs_json(report: RunsReport) -> dict[str, Any]:
         "samples": first.identity.get("samples"),
         "units": report.units,
         "denominators": {"runs": len(report.runs), **({report.kind: report.number} if report.number else {})},
-        "notes": [f"{run.title}: {note}" for run in report.runs for note in run.notes],
+        "notes": report.notes,
     }
 
 

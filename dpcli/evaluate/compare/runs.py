@@ -14,19 +14,19 @@ from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Interval
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed
 from dpcli.evaluate.compare.measure_file import measure_file
-from dpcli.evaluate.results import samples_json
+from dpcli.evaluate.results import LeftOut, left_out_note, samples_json
 from dpcli.evaluate.video.sources.open_source import is_media
 from dpcli.store.file import is_hdf5
 from dpcli.text_files import parse_json, read_text
 
-_OPTIONAL = {"samples": dict, "denominators": dict, "notes": list}
+_OPTIONAL = {"samples": dict, "denominators": dict, "notes": list, "left_out": list}
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
 
 
 @dataclass(frozen=True)
 class Run:
     """Holds the metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first;
-    `notes`: on how it was evaluated.
+    `notes`: on how it was evaluated, and what was left out; `seed`: of its training, None where nothing says it.
     """
 
     title: str
@@ -36,6 +36,7 @@ class Run:
     units: dict[str, str]
     identity: dict[str, Any]
     notes: list[str] = field(default_factory=list)
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,15 @@ class RunsReport:
     confidence: float
     kind: str
     number: int
+
+    @property
+    def notes(self) -> list[str]:
+        """Returns what is to know of the runs: of all of them together where all say the same, and which may be one run twice."""
+        shared = [
+            note for note in self.runs[0].notes if len(self.runs) > 1 and all(note in run.notes for run in self.runs)
+        ]
+        own = [f"{run.title}: {note}" for run in self.runs for note in run.notes if note not in shared]
+        return [*(f"All runs: {note}" for note in shared), *own, *_repeated(self.runs)]
 
     @property
     def spreads(self) -> dict[str, Spread]:
@@ -129,7 +139,8 @@ def _file_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]
     title = f"seed {found[0].seed}" if found[0].seed is not None else Path(source).stem
     metrics = {key: None if math.isnan(value) else value for key, value in values.items()}
     notes = [note for one in found for note in one.notes]
-    return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity, notes)]
+    notes += dict.fromkeys(left_out_note(entry, one.kind.removesuffix("s")) for one in found for entry in one.left_out)
+    return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity, notes, found[0].seed)]
 
 
 def _facts(found: Sequence[FileMetrics]) -> dict[str, Any]:
@@ -173,6 +184,9 @@ def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
     if bad:
         raise DataError(f"{source}: {', '.join(bad)} of {len(metrics)} metrics not finite; evaluate again")
     counts = own.get("denominators") or {}
+    notes = [note for note in own.get("notes") or [] if isinstance(note, str)]
+    kind = str((own.get("samples") or {}).get("kind", "")).removesuffix("s")
+    notes += [left_out_note(LeftOut(*entry), kind) for entry in map(_left_out, own.get("left_out") or []) if entry]
     identity = {
         "kind": "JSON",
         "protocol": own["protocol"],
@@ -186,8 +200,16 @@ def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
         metrics,
         {key: str(own["units"][key]) for key in metrics},
         identity,
-        [note for note in own.get("notes") or [] if isinstance(note, str)],
+        notes,
+        _seed(own),
     )
+
+
+def _left_out(entry: Any) -> tuple[str, list[str]] | None:
+    """Returns the reason and the names of an entry of `left_out_json`, None for anything else."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("names"), list):
+        return None
+    return str(entry.get("reason", "")), list(map(str, entry["names"]))
 
 
 def _is_number(value: Any) -> bool:
@@ -195,9 +217,13 @@ def _is_number(value: Any) -> bool:
 
 
 def _title(own: dict[str, Any], source: str) -> str:
-    history = own.get("provenance")
-    seed = history_seed([entry for entry in history if isinstance(entry, dict)]) if isinstance(history, list) else None
+    seed = _seed(own)
     return f"seed {seed}" if seed is not None else Path(str(own.get("input", source))).stem
+
+
+def _seed(own: dict[str, Any]) -> int | None:
+    history = own.get("provenance")
+    return history_seed([entry for entry in history if isinstance(entry, dict)]) if isinstance(history, list) else None
 
 
 def _check_same_experiment(first: Run, other: Run) -> None:
@@ -225,6 +251,19 @@ def _differing(one: Any, two: Any) -> str:
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _repeated(runs: Sequence[Run]) -> list[str]:
+    """Returns a sentence where runs have one seed and equal metrics, as copies of a file and a training repeated have."""
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for run in runs:
+        groups.setdefault((run.seed, *run.metrics.values()), []).append(run.title)
+    return [
+        f"{', '.join(titles[:-1])} and {titles[-1]} have {'no known seed' if seed is None else 'the same seed'} and equal metrics: if they"
+        " are copies of one run, or a run repeated, it counts more than once, and sd and interval are too small."
+        for (seed, *_), titles in groups.items()
+        if len(titles) > 1
+    ]
 
 
 def _distinct_titles(runs: Sequence[Run]) -> list[Run]:

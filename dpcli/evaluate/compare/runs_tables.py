@@ -28,7 +28,7 @@ def runs_tables(report: RunsReport) -> list[TextTable]:
 def runs_notes(report: RunsReport) -> list[str]:
     """Returns sentences on what a run is, and what the spread says."""
     lines = [f"{run.title}: {run.source}" for run in report.runs]
-    lines += [f"{run.title}: {note}" for run in report.runs for note in run.notes]
+    lines += report.notes
     number_of = counted(report.number, report.kind.removesuffix("s")) if report.number else "the same samples"
     if len(report.runs) == 1:
         lines.append(f"On {number_of}. One run only: its spread is undefined.")

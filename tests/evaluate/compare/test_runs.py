@@ -164,3 +164,33 @@ def test_kept_statistics_say_how_to_become_a_result(run, parts, tmp_path):
     for words in (("runs", kept), ("compare", kept, kept), ("report", kept)):
         with pytest.raises(DataError, match="evaluate segmentation FILE --json"):
             collect([str(kept)]) if words[0] == "report" else run(*words)
+
+
+def test_what_is_left_out_of_runs_is_counted(run, tmp_path):
+    """A video without a label is in no number, whether runs are files or JSON; what all leave out is said once."""
+
+    def unlabeled(name: str, row: int, **options) -> str:
+        path = write_scores(tmp_path / f"{name}.h5", {1}, **options)
+        with h5py.File(path, "r+") as file:
+            file["label"][row] = -1
+        return str(path)
+
+    both = [unlabeled("a", 3, seed=0), unlabeled("b", 3, seed=1)]
+    lines = [
+        CliRunner().invoke(evaluate.ROOM.application(), ["classification", path, "--json", "--resamples", "0"]).stdout
+        for path in both
+    ]
+    (tmp_path / "both.json").write_text("".join(lines))
+    told = "All runs: Left out, unknown label (-1): 1 sample (v3)."
+    for files in (both, [tmp_path / "both.json"]):
+        assert json.loads(run("runs", *files, "--json"))["notes"] == [told]
+        assert run("runs", *files).count("Left out") == 1
+
+
+def test_a_run_that_counts_twice_is_told(run, scores, tmp_path):
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes(scores["good"].read_bytes())
+    told = json.loads(run("runs", scores["good"], copy, scores["close"], "--json"))["notes"]
+    assert len(told) == 1 and told[0].startswith("seed 0 #1 and seed 0 #2 have the same seed and equal metrics")
+    equal = write_scores(tmp_path / "equal.h5", {0, 1, 2, 3, 4}, seed=7)  # as good by another training
+    assert json.loads(run("runs", scores["good"], equal, "--json"))["notes"] == []
