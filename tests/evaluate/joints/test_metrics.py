@@ -79,6 +79,8 @@ def test_frame_0_whose_value_is_0_by_definition_does_not_dilute_the_error(frames
 def test_wrong_types_and_unmatched_parts_count_as_missed():
     wrong = joints((1, 0, FIXED, (0, 0, 0), (0, 0, 0), 0), (2, 0, PRISMATIC, (1, 0, 0), (0, 0, 0), (0, 0.1)))
     assert joint_statistics(PART, TRUTH, PART, wrong).types == 1
+    for own, edges in ((9, 1), (10, 2)):  # of the 20 points of part 1; at IoU 0.5 it is found
+        assert joint_statistics(PART, TRUTH, np.repeat([0, 1, 2], [20, own, 40 - own]), TRUTH).edges == edges
     merged = np.zeros(60, int)
     found = joint_statistics(PART, TRUTH, merged, no_joints(2, 3))
     assert (found.joints, found.edges, found.predicted) == (2, 0, 0)
