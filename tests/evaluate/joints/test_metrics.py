@@ -106,6 +106,11 @@ def test_a_motion_below_the_distance_between_points_is_not_visible():
     truth = CloudSequence.from_frames("sheets", [cloud.astype(np.float32) for cloud in clouds], part=part)
     assert joint_visibility(truth, pose, 1, 0) > 2 * VISIBLE
     assert 0.9 < joint_visibility(truth, pose, 2, 0) < 1.15
+    for count, seen in ((4, False), (5, True)):  # a child of fewer points shows no motion
+        few = [np.concatenate([own[:200], own[200 : 200 + count]]) for own in part]
+        held = [np.concatenate([cloud[:200], cloud[200 : 200 + count]]) for cloud in clouds]
+        short = CloudSequence.from_frames("few", [own.astype(np.float32) for own in held], part=few)
+        assert (joint_visibility(short, pose, 2, 0) > 0) == seen
     with pytest.raises(DataError, match="poses of 2 parts"):
         joint_visibility(truth, pose[:, :2], 2, 0)
 
