@@ -222,7 +222,7 @@ def test_motions_of_many_pairs_are_averaged():
 
 def test_a_plate_has_its_normal_and_both_edges_as_directions():
     turn = about((0.6, 0.8, 0), 0.7)[:3, :3]
-    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T
+    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T + [5, -3, 2]
     found = directions_and_edges(plate)
     assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
     assert len(distinct_directions(found)) == 3
