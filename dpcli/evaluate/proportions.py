@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
-
-_NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 
 
 def divide(numerator: np.ndarray | float, denominator: np.ndarray | float) -> np.ndarray:
@@ -47,12 +46,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """
     if trials == 0:
         return math.nan, math.nan
-    if confidence != 0.95:
-        from scipy.stats import binomtest
-
-        ends = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-        return float(ends.low), float(ends.high)
-    share, z2 = successes / trials, _NORMAL_95**2
+    share, z2 = successes / trials, NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
     center = (share + z2 / (2 * trials)) / (1 + z2 / trials)
     half = math.sqrt(share * (1 - share) * z2 / trials + (z2 / (2 * trials)) ** 2) / (1 + z2 / trials)
     return max(0.0, center - half), min(1.0, center + half)

@@ -166,6 +166,7 @@ class _Rotation(torch.autograd.Function):
         left, values, right, norm = ctx.saved_tensors
         inner = left.mT @ grad @ right.mT
         sums = values[..., :, None] + values[..., None, :]
-        open_turn = sums.abs() < 10 * _TOWARD_IDENTITY
+        # s_1 >= s_2 >= |s_3|: a sum is below 0 only on the diagonal, where A is 0
+        open_turn = sums < 10 * _TOWARD_IDENTITY
         inner = torch.where(open_turn, 0.0, (inner - inner.mT) / torch.where(open_turn, 1.0, sums))
         return left @ inner @ right / norm.clamp(min=_EMPTY), None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.ops.rotations import nearest_rotation
 from dpcli.segment.rigid_motions import bring_to_rest, move
 from dpcli.store import CloudSequence, PartsSample
 
@@ -83,10 +84,7 @@ def _averaged(motion: np.ndarray, edges: list, seen: np.ndarray) -> np.ndarray:
         weight[target] += counts
     mean = total / np.maximum(weight, 1e-9)[..., None, None]
     mean[0] = np.eye(4)
-    u, _, v = np.linalg.svd(mean[..., :3, :3])
-    flip = np.ones((*mean.shape[:2], 3))
-    flip[..., 2] = np.linalg.det(u @ v)
-    mean[..., :3, :3] = u * flip[..., None, :] @ v
+    mean[..., :3, :3] = nearest_rotation(mean[..., :3, :3])
     return mean
 
 

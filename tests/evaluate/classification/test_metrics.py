@@ -190,7 +190,8 @@ def test_wilson_interval_solves_the_score_equation(hits: int, trials: int) -> No
 def test_wilson_interval_against_scipy() -> None:
     from scipy.stats import binomtest
 
-    for hits, trials in [(193, 227), (3, 7), (0, 5)]:
-        expected = binomtest(hits, trials).proportion_ci(method="wilson")
-        assert wilson_interval(hits, trials) == pytest.approx((expected.low, expected.high), abs=1e-9)
+    for hits, trials, confidence in [(193, 227, 0.95), (3, 7, 0.95), (0, 5, 0.8), (4, 4, 0.99), (193, 227, 0.5)]:
+        expected = binomtest(hits, trials).proportion_ci(confidence, method="wilson")
+        found = wilson_interval(hits, trials, confidence)
+        assert found == pytest.approx((expected.low, expected.high), abs=1e-9)
     assert all(math.isnan(end) for end in wilson_interval(0, 0))

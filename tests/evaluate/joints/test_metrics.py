@@ -79,6 +79,8 @@ def test_frame_0_whose_value_is_0_by_definition_does_not_dilute_the_error(frames
 def test_wrong_types_and_unmatched_parts_count_as_missed():
     wrong = joints((1, 0, FIXED, (0, 0, 0), (0, 0, 0), 0), (2, 0, PRISMATIC, (1, 0, 0), (0, 0, 0), (0, 0.1)))
     assert joint_statistics(PART, TRUTH, PART, wrong).types == 1
+    for own, edges in ((9, 1), (10, 2)):  # of the 20 points of part 1; at IoU 0.5 it is found
+        assert joint_statistics(PART, TRUTH, np.repeat([0, 1, 2], [20, own, 40 - own]), TRUTH).edges == edges
     merged = np.zeros(60, int)
     found = joint_statistics(PART, TRUTH, merged, no_joints(2, 3))
     assert (found.joints, found.edges, found.predicted) == (2, 0, 0)
@@ -104,6 +106,11 @@ def test_a_motion_below_the_distance_between_points_is_not_visible():
     truth = CloudSequence.from_frames("sheets", [cloud.astype(np.float32) for cloud in clouds], part=part)
     assert joint_visibility(truth, pose, 1, 0) > 2 * VISIBLE
     assert 0.9 < joint_visibility(truth, pose, 2, 0) < 1.15
+    for count, seen in ((4, False), (5, True)):  # a child of fewer points shows no motion
+        few = [np.concatenate([own[:200], own[200 : 200 + count]]) for own in part]
+        held = [np.concatenate([cloud[:200], cloud[200 : 200 + count]]) for cloud in clouds]
+        short = CloudSequence.from_frames("few", [own.astype(np.float32) for own in held], part=few)
+        assert (joint_visibility(short, pose, 2, 0) > 0) == seen
     with pytest.raises(DataError, match="poses of 2 parts"):
         joint_visibility(truth, pose[:, :2], 2, 0)
 

@@ -112,6 +112,8 @@ def test_part_motions_by_hand() -> None:
     found = part_motion_update(points, truth, part, real, said)
     assert found.rotation == pytest.approx([0.2, 0], abs=1e-7) and found.displacement == pytest.approx([0, 0.5])
     assert found.unmatched == 1
+    alone = motion_compute(found)  # motions without any flow
+    assert np.isnan([alone.epe3d, alone.still, alone.shares[0.05].accs]).all() and alone.rotation == pytest.approx(0.1)
     unknown = part_motion_update(points, np.where(truth == 1, -1, truth), part, real, said)
     assert unknown.rotation == pytest.approx([0.2]) and unknown.unmatched == 1
 

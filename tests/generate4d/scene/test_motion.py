@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dpcli.generate4d.scene.control_points import ControlPoints
+from dpcli.generate4d.scene.control_points import ControlPoints, turn_frames
 from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
 from dpcli.generate4d.scene.losses import arap_loss
 from dpcli.generate4d.scene.motion import Motion, MotionField, encode
@@ -143,6 +143,8 @@ def _motion(quaternion: torch.Tensor, displacement: torch.Tensor) -> Motion:
 def test_skinning_is_equation_5_8_in_loops():
     torch.manual_seed(1)
     control = ControlPoints(torch.randn(12, 3), 4).double()
+    apart = torch.cdist(control.position, control.position).sort(1).values[:, 1:4].mean(1)
+    torch.testing.assert_close(control.log_radius.exp(), apart, atol=1e-5, rtol=1e-5)
     control.log_radius.data += torch.randn(12, dtype=torch.float64) * 0.3
     points = torch.randn(7, 3, dtype=torch.float64)
     turn = normalize_quaternion(torch.cat([torch.ones(2, 12, 1), torch.randn(2, 12, 3)], -1).double())
@@ -162,6 +164,12 @@ def test_skinning_is_equation_5_8_in_loops():
             torch.testing.assert_close(quaternion[b, i], normalize_quaternion((weight[:, None] * turn[b, k]).sum(0)))
 
 
+def test_control_points_in_one_place_share_what_they_carry():
+    control = ControlPoints(torch.zeros(3, 3), 3)
+    weights = control.weights(torch.tensor([[0.0, 0, 0], [5, 0, 0]]), torch.arange(3).expand(2, 3))
+    torch.testing.assert_close(weights, torch.full((2, 3), 1 / 3))
+
+
 def test_one_rigid_motion_of_all_control_points_carries_everything_rigidly():
     torch.manual_seed(2)
     points = torch.randn(200, 3)
@@ -172,6 +180,9 @@ def test_one_rigid_motion_of_all_control_points_carries_everything_rigidly():
     moved, quaternion = control.carry(points, control.nearest(points), motion)
     torch.testing.assert_close(moved[0], _rigid_motion(points, turn, shift), atol=1e-5, rtol=0)
     torch.testing.assert_close(quaternion[0], turn.expand(200, 4), atol=1e-6, rtol=0)
+    own, frames = _rotations(200, 3)
+    turned = quaternion_to_matrix(turn_frames(quaternion.detach(), 2 * own.float())[0])
+    np.testing.assert_allclose(turned, quaternion_to_matrix(turn).numpy() @ frames, atol=1e-5)
 
 
 def test_gradients_through_skinning_are_those_of_finite_differences():
@@ -195,12 +206,18 @@ def test_gradients_through_skinning_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(outputs, (points, turn, shift, position, radius))
 
 
-def test_arap_is_zero_for_rigid_motions_and_sees_a_stretch():
+def test_arap_is_zero_for_rigid_motions_and_what_scipy_s_rotations_leave_of_others():
     torch.manual_seed(4)
     points = torch.randn(30, 3)
     neighbors = ball_neighbors(points, 2.0, 5)
     turn = normalize_quaternion(torch.randn(2, 4))
     rigid = torch.stack([_rigid_motion(points, q, torch.ones(3)) for q in turn])
     assert arap_loss(points, rigid, neighbors) < 1e-9
-    assert arap_loss(points, points[None] * torch.tensor([1.0, 1.5, 1.0]), neighbors) > 1e-2
-    assert arap_loss(points, points[None] * torch.tensor([-1.0, 1.0, 1.0]), neighbors) > 1e-2  # a mirror is no rotation
+    for stretch in ([1.0, 1.5, 1.0], [-1.0, 1.0, 1.0]):  # a mirror is no rotation
+        moved = torch.stack([points * torch.tensor(stretch), points + 0.1 * torch.randn(30, 3)])
+        left = [
+            Rotation.align_vectors((cloud[near] - cloud[i]).numpy(), (points[near] - points[i]).numpy())[1] ** 2
+            for cloud in moved
+            for i, near in enumerate(neighbors)
+        ]
+        assert arap_loss(points, moved, neighbors).item() == pytest.approx(np.mean(left) / 5, rel=1e-4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.segment.kinematics.joint_fit import fit_joint
+from dpcli.segment.kinematics.joint_fit import JointFit, _at_best_value, fit_joint, nearest_joints
 from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories, points_at_start
 from dpcli.segment.kinematics.registration import (
@@ -133,6 +133,28 @@ def test_noise_of_the_motions_moves_an_axis_little(kind, seed):
     np.testing.assert_allclose(fit.value * np.sign(fit.axis @ axis), value, atol=0.02)
 
 
+def test_a_joint_s_values_are_those_of_least_squares_in_each_frame_but_the_first():
+    rng = np.random.default_rng(0)
+    slope, rest = rng.normal(size=(2, 4, 6))
+    for kind in (REVOLUTE, PRISMATIC):
+        start = JointFit(kind, np.eye(3)[0], np.zeros(3), np.array([0, *rng.normal(size=3)]), 0.0)
+        error, value = _at_best_value(lambda _, value: slope * value[:, None] + rest, np.zeros(6), start, 2.0)
+        expected = [0, *(np.linalg.lstsq(slope[t, :, None], -rest[t])[0][0] for t in (1, 2, 3))]
+        assert value == pytest.approx(np.array(expected)) and error == pytest.approx(slope * value[:, None] + rest)
+
+
+def test_the_nearest_hinge_and_slide_are_exact_where_the_motion_is_one():
+    points, axis, place = np.random.default_rng(0).random((64, 3)), np.array([0.48, -0.6, 0.64]), [2, -1, 0.5]
+    value = np.linspace(0, 7, 9)  # more than one turn
+    hinge = nearest_joints(np.array([about(axis, v, place) for v in value]), points)[1]
+    slide = nearest_joints(np.array([along(axis, v) for v in value]), points)[0]
+    for fit in (hinge, slide):
+        side = np.sign(fit.axis @ axis)
+        assert side * fit.axis == pytest.approx(axis, abs=1e-6) and fit.residual < 1e-6
+        assert side * fit.value == pytest.approx(value, abs=1e-6)
+    assert np.cross(hinge.point - place, axis) == pytest.approx(np.zeros(3), abs=1e-6)
+
+
 def test_one_part_has_no_joint_and_frames_apart_are_a_sentence():
     alone = made(np.tile(np.eye(4), (3, 1, 1, 1)), [((0, 0, 0), (1, 1, 1))])
     assert kinematic_tree(*alone).joints == []
@@ -200,7 +222,7 @@ def test_motions_of_many_pairs_are_averaged():
 
 def test_a_plate_has_its_normal_and_both_edges_as_directions():
     turn = about((0.6, 0.8, 0), 0.7)[:3, :3]
-    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T
+    plate = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) * (0.6, 0.4, 0.002) @ turn.T + [5, -3, 2]
     found = directions_and_edges(plate)
     assert (np.abs(found @ turn).max(0) > np.cos(np.radians(4))).all()
     assert len(distinct_directions(found)) == 3
