@@ -296,7 +296,11 @@ def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any
     name and by digest, since what a name leads to may change."""
     schedule = {key: value for key, value in asdict(settings.schedule).items() if key != "workers"}
     run = {key: getattr(settings.run, key) for key in ("timing", "validation", "drop_short", *_STARTS)}
-    starts = {key.replace("_from", "") + "_weights": find_model(run[key], option) for key, option in _STARTS.items() if run[key]}
+    starts = {
+        key.replace("_from", "") + "_weights": find_model(run[key], option)
+        for key, option in _STARTS.items()
+        if run[key]
+    }
     record = {
         "network": asdict(settings.network),
         "schedule": schedule,

@@ -168,7 +168,9 @@ def test_weights_to_start_from_that_changed_make_another_run(start, model, tmp_p
     with torch.no_grad():
         next(network.parameters()).add_(1)
     save_model(weights, network, info)
-    with pytest.raises(UsageError, match=f"holds a run with another configuration .other {start.partition('_')[0]} weights"):
+    with pytest.raises(
+        UsageError, match=f"holds a run with another configuration .other {start.partition('_')[0]} weights"
+    ):
         train(str(data), str(tmp_path / "run"), given)
 
 
