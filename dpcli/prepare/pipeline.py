@@ -138,8 +138,13 @@ def _tell_newer(kept: Path, items: list[Item]) -> None:
     """Warns of inputs that are newer than what an earlier run left: fingerprints hold few sizes, and content may change without."""
     if not kept.is_file():
         return
-    made, date = _date(kept), cache(_date)  # items may share a folder
-    newer = [item.name for item in items if max(map(date, (item.path, *item.extra.get("files", ())))) > made]
+    (made, moved), dates = _dates(kept), cache(_dates)  # items may share a folder
+
+    def is_newer(path: Path) -> bool:
+        written, put_there = dates(path)
+        return written > made or put_there > max(made, moved)
+
+    newer = [item.name for item in items if any(map(is_newer, (item.path, *item.extra.get("files", ()))))]
     if newer:
         log.warn(
             f"newer than what an earlier run left ({kept.name}), and not read again where that had them: {first_names(newer)};"
@@ -147,19 +152,17 @@ def _tell_newer(kept: Path, items: list[Item]) -> None:
         )
 
 
-def _date(path: Path) -> float:
-    """Returns when a file, or the newest one of a folder, was written or put there; 0 where there is none."""
+def _dates(path: Path) -> tuple[float, float]:
+    """Returns when a file, or the newest one of a folder, was written, and when it was put there; 0 where there is none.
+
+    What an archive or `rsync -a` puts there has the date of its writing, long ago.
+    """
     with suppress(OSError, ValueError):
         own = path.stat()
         with os.scandir(path) if stat.S_ISDIR(own.st_mode) else nullcontext(()) as inside:
-            files = [_changed(one.stat()) for one in inside if one.is_file() and not _may_be_ours(one.name)]
-            return max(files, default=_changed(own))
-    return 0.0
-
-
-def _changed(facts: os.stat_result) -> float:
-    """Returns the later of two dates: what an archive or `rsync -a` puts there has the date of its writing, long ago."""
-    return max(facts.st_mtime, facts.st_ctime)
+            files = [one.stat() for one in inside if one.is_file() and not _may_be_ours(one.name)] or [own]
+            return max(one.st_mtime for one in files), max(one.st_ctime for one in files)
+    return 0.0, 0.0
 
 
 def _may_be_ours(name: str) -> bool:

@@ -344,6 +344,9 @@ def test_inputs_that_are_newer_than_the_output_are_named(tmp_path, capsys, shape
         f"newer than what an earlier run left (out.h5), and not read again where that had them: {changed.relative_to(raw).parts[0]};"
         in told
     )
+    os.rename(output, raw / "other.h5")  # which makes the file later than its content
+    assert convert(DepthVideos(inputs=(raw,)), raw / "other.h5").was_complete
+    assert ("newer than" in capsys.readouterr().err) != old_date
 
 
 def test_the_last_frame_counts_whatever_lies_behind_it_in_the_folder(tmp_path):
