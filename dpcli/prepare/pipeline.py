@@ -106,7 +106,8 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     fingerprint = cache(_fingerprint)  # items may share a folder
     for item in items:
         facts = [item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path)]
-        facts += item.extra.get("sizes", [])  # of its own files, where its path is a folder of all items
+        facts += map(fingerprint, item.extra.get("files", ()))
+        facts += map(fingerprint, series.paths[-1:] if (series := item.extra.get("series")) else ())
         beside = getattr(item.extra.get("series"), "beside", None)  # times that may lie in the folder above
         facts += beside.seconds.tolist() if beside else []
         digest.update("\n".join(map(str, facts)).encode())
@@ -134,11 +135,16 @@ def _fingerprint(path: Path) -> str:
 
 
 def _tell_newer(kept: Path, items: list[Item]) -> None:
-    """Warns of inputs that are newer than what an earlier run left: fingerprints hold sizes, and content may change without."""
+    """Warns of inputs that are newer than what an earlier run left: fingerprints hold few sizes, and content may change without."""
     if not kept.is_file():
         return
-    made, date = kept.stat().st_mtime, cache(_date)  # items may share a folder
-    newer = [item.name for item in items if date(item.path) > made]
+    (made, moved), dates = _dates(kept), cache(_dates)  # items may share a folder
+
+    def is_newer(path: Path) -> bool:
+        written, put_there = dates(path)
+        return written > made or put_there > max(made, moved)
+
+    newer = [item.name for item in items if any(map(is_newer, (item.path, *item.extra.get("files", ()))))]
     if newer:
         log.warn(
             f"newer than what an earlier run left ({kept.name}), and not read again where that had them: {first_names(newer)};"
@@ -146,14 +152,17 @@ def _tell_newer(kept: Path, items: list[Item]) -> None:
         )
 
 
-def _date(path: Path) -> float:
-    """Returns when a file, or the newest one of a folder, was written; 0 where there is none."""
+def _dates(path: Path) -> tuple[float, float]:
+    """Returns when a file, or the newest one of a folder, was written, and when it was put there; 0 where there is none.
+
+    What an archive or `rsync -a` puts there has the date of its writing, long ago.
+    """
     with suppress(OSError, ValueError):
         own = path.stat()
         with os.scandir(path) if stat.S_ISDIR(own.st_mode) else nullcontext(()) as inside:
-            files = [one.stat().st_mtime for one in inside if one.is_file() and not _may_be_ours(one.name)]
-            return max(files, default=own.st_mtime)
-    return 0.0
+            files = [one.stat() for one in inside if one.is_file() and not _may_be_ours(one.name)] or [own]
+            return max(one.st_mtime for one in files), max(one.st_ctime for one in files)
+    return 0.0, 0.0
 
 
 def _may_be_ours(name: str) -> bool:

@@ -30,7 +30,8 @@ class Item:
     """Holds one sample of the index: what is known about it before its data are opened.
 
     A non-empty ``problem`` marks an entry that can't be read at all (a list line naming a missing file,
-    a label out of range); the pipeline reports it like a failed read and never calls the reader.
+    a label out of range); the pipeline reports it like a failed read and never calls the reader. ``extra``: what `read`
+    needs; ``files`` in it are those that it is read from, where ``path`` is not one of them or doesn't hold them itself.
     """
 
     name: str

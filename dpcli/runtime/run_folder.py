@@ -180,14 +180,29 @@ class RunFolder:
         return self.path / name
 
     def load_state(self) -> dict | None:
-        """Reads what an earlier, unfinished run saved; None for a fresh one."""
+        """Reads what an earlier run saved; None for a fresh one. Raises UsageError where it is gone, which would start over.
+
+        A state follows each row of a log that weights lie beside, so a kill leaves one such row without a state at most.
+        """
         path = self.path / "state.pt"
         if not path.exists():
+            if (self.path / "last.safetensors").exists() and len(self._logged()) > 1:
+                raise UsageError(
+                    f"{path}: is gone, and without it the run of this folder would start over and replace its weights; bring it"
+                    " back, use another -o, or --force to start over"
+                )
             return None
         with self.restoring():
             state = load_plain(path)
             self.rows = state["rows"]
         return state
+
+    def _logged(self) -> list:
+        """Returns the rows of the log that is there; none where it can't be read."""
+        try:
+            return list(read_json(self.path / "log.json"))
+        except (OSError, DataError):
+            return []
 
     @contextmanager
     def restoring(self) -> Iterator[None]:

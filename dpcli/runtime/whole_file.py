@@ -14,6 +14,7 @@ from pathlib import Path
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.regular_files import why_unreadable
+from dpcli.runtime.progress import log
 
 PICTURES = (".png", ".jpg", ".jpeg")
 FIGURES = (*PICTURES, ".pdf", ".svg")
@@ -80,9 +81,14 @@ def reserve(file: int, size: int) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Brings `part`, a finished file or folder, to the disk and renames it to `path`, which it replaces. OSError: it can't."""
+    """Brings `part`, a finished file or folder, to the disk and renames it to `path`, which it replaces. OSError: it can't.
+
+    A link to a file is replaced, too, with a warning: what it leads to may be in the keeping of another program.
+    """
     if not part.is_dir():
         _sync(part)
+        if path.is_symlink():
+            log.warn(f"{path}: was a link and is a file now; {os.path.realpath(path)}, where it led to, is as it was")
         os.replace(part, path)
         return
     for one in part.rglob("*"):

@@ -321,8 +321,9 @@ def test_a_part_of_another_configuration_is_refused_and_force_starts_over(tmp_pa
     assert digest(path) == digest(tmp_path / "fresh.h5")
 
 
+@pytest.mark.parametrize("old_date", [False, True])  # as what an archive or `rsync -a` puts there has
 @pytest.mark.parametrize("shape", ["file", "folder"])
-def test_inputs_that_are_newer_than_the_output_are_named(tmp_path, capsys, shape):
+def test_inputs_that_are_newer_than_the_output_are_named(tmp_path, capsys, shape, old_date):
     raw = tmp_path / "raw"
     for name in "ab":
         (raw / name).mkdir(parents=True)
@@ -335,14 +336,28 @@ def test_inputs_that_are_newer_than_the_output_are_named(tmp_path, capsys, shape
     convert(DepthVideos(inputs=(raw,)), output)
     assert convert(DepthVideos(inputs=(raw,)), output).was_complete and "newer than" not in capsys.readouterr().err
     changed = raw / "a.npy" if shape == "file" else raw / "a" / "1.npy"
-    later = output.stat().st_mtime + 10
-    os.utime(changed, (later, later))
+    date = 1e9 if old_date else output.stat().st_mtime + 10
+    os.utime(changed, (date, date))
     assert convert(DepthVideos(inputs=(raw,)), output).was_complete  # copying changes dates, too
     told = capsys.readouterr().err
     assert (
         f"newer than what an earlier run left (out.h5), and not read again where that had them: {changed.relative_to(raw).parts[0]};"
         in told
     )
+    os.rename(output, raw / "other.h5")  # which makes the file later than its content
+    assert convert(DepthVideos(inputs=(raw,)), raw / "other.h5").was_complete
+    assert ("newer than" in capsys.readouterr().err) != old_date
+
+
+def test_the_last_frame_counts_whatever_lies_behind_it_in_the_folder(tmp_path):
+    for t in range(3):
+        np.savetxt(tmp_path / f"{t}.xyz", np.full((5, 3), t))
+    (tmp_path / "z.log").write_text("done")
+    convert(CloudFolders(tmp_path), tmp_path / "out.h5")
+    assert convert(CloudFolders(tmp_path), tmp_path / "out.h5").was_complete
+    np.savetxt(tmp_path / "2.xyz", np.full((6, 3), 2))
+    with pytest.raises(UsageError, match="exists, made with other samples, labels or sizes of files"):
+        convert(CloudFolders(tmp_path), tmp_path / "out.h5")
 
 
 def test_other_data_labels_or_classes_under_the_same_names_are_not_already_complete(tmp_path):

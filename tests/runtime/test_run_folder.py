@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from dpcli.classify.training.trainer import Trainer
-from dpcli.errors import DpcError, Stopped
+from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.runtime import run_folder
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.store import ScoresReader
@@ -200,6 +200,27 @@ def test_a_finished_training_says_so(data, finished, dpc_here):
     again = dpc_here("classify", "train", data, "-o", finished, *SHORT)
     assert again.returncode == 0 and b"best.safetensors" in again.stdout and contents(finished) == before
     assert b"is finished already" in again.stderr and b"--force" in again.stderr and b"continuing" not in again.stderr
+
+
+@pytest.mark.parametrize("rows, told", [(2, True), (1, False)])
+def test_weights_whose_state_is_gone_are_not_trained_over(rows, told, tmp_path):
+    """As of a copied folder that lacks the largest file; a kill leaves one row without a state, and then it starts over."""
+
+    def run(force: bool = False) -> RunFolder:
+        return RunFolder(tmp_path / "run", {"seed": 0}, force, columns=["epoch"])
+
+    with run() as folder:
+        for epoch in range(rows):
+            folder.log({"epoch": epoch})
+        folder.file("last.safetensors").write_bytes(b"weights")
+    for force in (False, True):
+        with run(force) as folder:
+            if told and not force:
+                with pytest.raises(UsageError, match=r"state\.pt: is gone, and without it .* --force to start over"):
+                    folder.load_state()
+            else:
+                assert folder.load_state() is None
+            assert folder.file("last.safetensors").exists() != force
 
 
 def test_the_largest_seed_trains_and_is_kept_in_files(data, tmp_path, dpc_here):

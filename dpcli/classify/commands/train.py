@@ -58,6 +58,7 @@ from dpcli.store import CloudsReader, input_file
 from dpcli.store.scores import check_class_names
 
 AUTO = "auto"  # the preset that the data choose
+_STARTS = {"static_from": "static_from =", "init": "--init"}  # settings that name trained weights, as errors call them
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
 
 
@@ -293,14 +294,21 @@ def _tests(reader: CloudsReader) -> list[int]:
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
-    """Returns what shapes the result, for `config.json`: not how many processes load clips."""
+    """Returns what shapes the result, for `config.json`: not how many processes load clips. Weights to start from are there by
+    name and by digest, since what a name leads to may change."""
     schedule = {key: value for key, value in asdict(settings.schedule).items() if key != "workers"}
-    run = {key: getattr(settings.run, key) for key in ("timing", "validation", "drop_short", "static_from", "init")}
+    run = {key: getattr(settings.run, key) for key in ("timing", "validation", "drop_short", *_STARTS)}
+    starts = {
+        key.replace("_from", "") + "_weights": find_model(run[key], option)
+        for key, option in _STARTS.items()
+        if run[key]
+    }
     record = {
         "network": asdict(settings.network),
         "schedule": schedule,
         "augmentation": asdict(settings.augmentation),
         **run,
+        **{key: provenance.file_digest(file) for key, file in starts.items()},
         "seed": seed,
         "data": digest,
     }
@@ -367,7 +375,8 @@ def _new_model(settings: TrainingSettings, videos: _Videos, folder: RunFolder) -
     and class names agree."""
     config, run = settings.network, settings.run
     model = Kinet(config)
-    for name, option, alone in ((run.static_from, "static_from =", True), (run.init, "--init", False)):
+    for key, option in _STARTS.items():
+        name, alone = getattr(run, key), key == "static_from"
         if not name:
             continue
         weights = find_model(name, option)

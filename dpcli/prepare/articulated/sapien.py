@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
 from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
-from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
+from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import Item, Sample, describe, natural_key
@@ -138,7 +138,7 @@ class Sapien:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found = find_objects(self.raw)
         splits = self.split.assign([f.category for f in found], self.seed)
-        problems, joints = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
+        problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
         pad = min(self.articulation.max_parts, 1 + max(joints))
         labels = {name: label for label, name in enumerate(self.class_names)}
         return [
@@ -147,10 +147,10 @@ class Sapien:
                 f.path,
                 split=split,
                 label=labels[f.category] if f.category else -1,
-                extra={"parts": pad, "first": number == 0},
+                extra={"parts": pad, "first": number == 0, "files": own},
                 problem=problem,
             )
-            for f, split, problem in zip(found, splits, problems)
+            for f, split, problem, own in zip(found, splits, problems, meshes)
             for number in range(1 if problem else self.pairs_per_object)
         ]
 
@@ -173,21 +173,22 @@ class Sapien:
         )
 
 
-def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
-    """Returns (problem that shows without the meshes' content, number of joints). given: what the user named."""
+def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int, list[Path]]:
+    """Returns (problem that shows without the meshes' content, number of joints, mesh files). given: what the user named."""
     try:
         if path != given:
             path_inside(root, path.parent, path.name)
     except DataError as error:
-        return f"{path}: {error} (--allow-outside opens others)", 0
+        return f"{path}: {error} (--allow-outside opens others)", 0, []
     try:
         skeleton = read_skeleton(path, root)
-        missing = missing_meshes(skeleton)
+        meshes = mesh_files(skeleton)
     except DataError as error:
-        return str(error), 0
+        return str(error), 0, []
+    missing = [name for name, file in meshes.items() if not file.is_file()]
     if missing:
         more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
-        return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0
+        return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0, []
     if not skeleton.joints:
-        return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0
-    return "", len(skeleton.joints)
+        return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0, []
+    return "", len(skeleton.joints), list(meshes.values())

@@ -98,13 +98,13 @@ def load_object(skeleton: Skeleton) -> ArticulatedObject:
     return ArticulatedObject(str(skeleton.path), list(skeleton.joints), *kept, notes)
 
 
-def missing_meshes(skeleton: Skeleton) -> list[str]:
-    """Returns file names of visual meshes that don't exist, as the URDF spells them.
+def mesh_files(skeleton: Skeleton) -> dict[str, Path]:
+    """Returns where the visual meshes are, or would be, by their names as the URDF spells them.
 
     Raises DataError when one lies outside the skeleton's root.
     """
     names = [geometry.mesh.filename for _, _, geometry in skeleton.shapes if geometry.mesh is not None]
-    return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name, skeleton.root).is_file()]
+    return {name: resolve(skeleton.path, name, skeleton.root) for name in names}
 
 
 def _parse(path: Path, notes: Counter) -> Any:

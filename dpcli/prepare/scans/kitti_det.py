@@ -19,7 +19,6 @@ from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
     check_objects,
-    file_sizes,
     missing_files_problem,
     names_in,
     orient_points,
@@ -149,7 +148,7 @@ class KittiDetection:
                 name,
                 folder,
                 split=split.get(name, ""),
-                extra=file_sizes([folder / key / f"{name}{end}" for key, end in (*_FILES.items(), *_OTHERS.items())]),
+                extra={"files": [folder / key / f"{name}{end}" for key, end in (*_FILES.items(), *_OTHERS.items())]},
                 problem=missing_files_problem([folder / key / f"{name}{end}" for key, end in _FILES.items()])
                 if name in present
                 else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",

@@ -65,11 +65,6 @@ def missing_files_problem(paths: list[Path]) -> str:
     return f"{missing[0]}: missing{more}" if missing else ""
 
 
-def file_sizes(paths: list[Path]) -> dict[str, list[int]]:
-    """Returns what an item's ``extra`` has of its files, whose folder all items share: their sizes, -1 of missing ones."""
-    return {"sizes": [path.stat().st_size if path.is_file() else -1 for path in paths]}
-
-
 def read_calibration(path: Path) -> dict[str, np.ndarray]:
     """Reads ``KEY: numbers`` lines as f64 arrays; lines that hold no numbers, such as calib_time, are passed over."""
     try:

@@ -14,7 +14,6 @@ from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
-    file_sizes,
     missing_files_problem,
     names_in,
     orient_points,
@@ -137,7 +136,7 @@ class KittiSceneFlow:
                 name,
                 folder,
                 split="train" if int(name) < TRAIN_SCENES else "test",
-                extra=file_sizes(list(self._files(folder, name).values())),
+                extra={"files": list(self._files(folder, name).values())},
                 problem=missing_files_problem(list(self._files(folder, name).values())),
             )
             for name in names

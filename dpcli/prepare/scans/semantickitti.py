@@ -20,7 +20,6 @@ from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
     check_objects,
-    file_sizes,
     is_no_camera,
     names_in,
     orient_points,
@@ -144,7 +143,7 @@ class SemanticKitti:
                 problem = self._problem(folder, window)
                 files = [folder / "velodyne" / f"{name}.bin" for name in window]
                 files += [folder / "labels" / f"{name}.label" for name in window]
-                extra = {"scans": window, **file_sizes([*files, folder / "calib.txt", folder / "poses.txt"])}
+                extra = {"scans": window, "files": [*files, folder / "calib.txt", folder / "poses.txt"]}
                 items.append(Item(f"{sequence}_{window[0]}", folder, split=split, extra=extra, problem=problem))
         if not items:
             raise DataError(f"{self.raw}: no sequence holds {counted(self.frames, 'scan')} (velodyne/000000.bin ...)")

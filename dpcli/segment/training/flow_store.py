@@ -18,8 +18,8 @@ _THERE, _BODIES, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
 class FlowStore:
     """Keeps flows f32 (pairs,2,N,3), forth and back: `flows_first.npy` as estimated, `flows.npy` as corrected since.
 
-    `flows_known.npy` u8 (pairs) tells what is there. take_from: another run's folder whose first flows a fresh run begins
-    with.
+    `flows_known.npy` u8 (pairs) tells what is there. fresh: makes the files; else they have to be there, or DataError.
+    take_from: another run's folder whose first flows a fresh run begins with.
 
     Changes wait in memory until `flush`, which the trainer calls after it has saved them with its own state: a run that
     is killed finds either both or neither, and changes nothing twice. Memory: the changes since the last checkpoint.
@@ -120,10 +120,19 @@ def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.nd
 
 
 def _map_file(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
-    """Returns the array of a file, mapped into memory; a new one where it is `fresh` or has another shape."""
-    if not fresh and path.exists():
-        with reading(path):
-            array = np.lib.format.open_memmap(path, "r+")
-        if array.shape == shape:
-            return array
-    return np.lib.format.open_memmap(path, "w+", dtype, shape)
+    """Returns the array of a file, mapped into memory; where it is `fresh` a new one.
+
+    Raises DataError where a file that a run goes on with is gone or another one: zeros in its place would be learned from.
+    """
+    if fresh:
+        return np.lib.format.open_memmap(path, "w+", dtype, shape)
+    if not path.exists():
+        raise DataError(f"{path}: is gone, and the run goes on with its flows; bring it back, or --force to start over")
+    with reading(path):
+        array = np.lib.format.open_memmap(path, "r+")
+    if (array.shape, array.dtype) != (shape, dtype):
+        raise DataError(
+            f"{path}: holds {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}, as the run left it;"
+            " bring that back, or --force to start over"
+        )
+    return array

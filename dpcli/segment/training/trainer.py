@@ -69,13 +69,12 @@ class Trainer:
     def run(self) -> None:
         """Trains from wherever the folder's state says to the last epoch."""
         state = self.folder.load_state()
-        shape = (len(self.training.pairs), self.training.points)
-        first = self.settings.run.flows_of
-        self.flows = FlowStore(self.folder.path, *shape, state is None, Path(first) if first else None)
         if state is not None:
             with self.folder.restoring():
                 self._restore(state)
         finished = self.epoch >= self.schedule.epochs  # by an earlier run
+        if not finished or self.folder.file("flows.npy").exists():  # which nothing needs after the end, and is large
+            self._open_flows(state)
         total = self.schedule.epochs * self._steps() * self.schedule.batch
         with Progress("train parts", total, "pair") as bar:
             bar.skip((self.epoch * self._steps() + self.step) * self.schedule.batch)
@@ -83,6 +82,14 @@ class Trainer:
                 self._run_epoch(bar)
         if self.validation is None and not (finished and self.folder.file("best.safetensors").exists()):
             save_model(self.folder.file("best.safetensors"), self.model, self.notes)
+
+    def _open_flows(self, state: dict | None) -> None:
+        """Opens the run's flows, and writes what a run that was killed may not have written of them."""
+        shape, first = (len(self.training.pairs), self.training.points), self.settings.run.flows_of
+        self.flows = FlowStore(self.folder.path, *shape, state is None, Path(first) if first else None)
+        if state is not None:
+            with self.folder.restoring():
+                self.flows.restore(state["flows"])
 
     def _steps(self) -> int:
         """Returns the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
@@ -288,7 +295,6 @@ class Trainer:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.flows.restore(state["flows"])
         where = f"epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}"
         self.folder.tell_continuing(where if self.epoch < self.schedule.epochs else None)
 

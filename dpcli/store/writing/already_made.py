@@ -29,7 +29,7 @@ def already_made(
     target: Path,
     entry: dict[str, Any],
     reader: Callable[[Path], HasProvenance],
-    keys: Sequence[str] = ("config", "seed"),
+    keys: Sequence[str] = ("config", "seed", "inputs"),
 ) -> bool:
     """Returns whether `target` holds the result of the work that `entry`, a provenance entry, describes, and logs it.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -150,6 +152,26 @@ def test_other_classes_go_on_from_a_model_with_its_own_network(videos, model, tm
     theirs, ours = load_model(model)[0].state_dict(), made.state_dict()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours if ".head" not in name)
     assert done.videos == (0 if videos == 1 else 2)
+
+
+@pytest.mark.parametrize("start", ["init", "static_from"])
+def test_weights_to_start_from_that_changed_make_another_run(start, model, tmp_path):
+    """What was learned from the weights that lay there before is not given out as learned from those of now."""
+    data, weights = clouds(tmp_path / "c.h5", 1), tmp_path / "m.safetensors"
+    shutil.copy(model, weights)
+    sets = {**(SMALL if start == "static_from" else {}), "epochs_dynamic": 0, "clips_per_video": 1}
+    chosen = {"sets": sets | {start: str(weights)}, "flags": {"epochs": 1}}
+    given = Given("tiny", **chosen) if start == "static_from" else Given("auto", **chosen)
+    train(str(data), str(tmp_path / "run"), given)
+    train(str(data), str(tmp_path / "run"), given)
+    network, info = load_model(weights)
+    with torch.no_grad():
+        next(network.parameters()).add_(1)
+    save_model(weights, network, info)
+    with pytest.raises(
+        UsageError, match=f"holds a run with another configuration .other {start.partition('_')[0]} weights"
+    ):
+        train(str(data), str(tmp_path / "run"), given)
 
 
 def test_settings_are_held_against_the_model_s_network(model, tmp_path):

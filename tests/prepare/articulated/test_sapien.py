@@ -14,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, draw_sequence, study
 from dpcli.prepare.articulated.sapien import Sapien, find_objects
-from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
+from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 from tests.support.articulated_helpers import CUBE_OBJ, box, cabinet, joint, link, write_urdf
@@ -528,6 +529,20 @@ def test_names_of_ros_packages_and_of_browsers(tmp_path):
     assert not Sapien(path, allow_outside=True).items()[0].problem
 
 
+def test_another_mesh_of_the_same_name_is_told(tmp_path, capsys):
+    cabinet(tmp_path / "cabinet" / "mobility.urdf")
+    mesh, out = tmp_path / "cabinet" / "meshes" / "cube.obj", tmp_path / "x.h5"
+    reader, chosen = Sapien(tmp_path, pairs_per_object=1), Conversion(points=20)
+    convert(reader, out, chosen)
+    assert convert(reader, out, chosen).was_complete and "newer than" not in capsys.readouterr().err
+    mesh.write_text(CUBE_OBJ.replace("1", "2", 1))
+    assert convert(reader, out, chosen).was_complete
+    assert "newer than what an earlier run left (x.h5), and not read again" in capsys.readouterr().err
+    mesh.write_text(CUBE_OBJ + "# another")
+    with pytest.raises(UsageError, match="exists, made with other samples, labels or sizes of files"):
+        convert(reader, out, chosen)
+
+
 @pytest.mark.parametrize("name", ["meshes\\c.obj", "Meshes/C.OBJ", "package://robot/MESHES/c.Obj"])
 def test_names_written_on_windows(name, tmp_path):
     (tmp_path / "meshes").mkdir()
@@ -536,7 +551,7 @@ def test_names_written_on_windows(name, tmp_path):
     path = write_urdf(tmp_path / "r.urdf", *elements)
     assert len(load_object(read_skeleton(path, tmp_path)).triangles) == 24
     (tmp_path / "meshes" / "C.obj").write_text("")  # now capitals tell two files apart
-    assert ("\\" in name) != bool(missing_meshes(read_skeleton(path, tmp_path)))
+    assert ("\\" in name) == all(file.is_file() for file in mesh_files(read_skeleton(path, tmp_path)).values())
 
 
 def test_meshes_as_windows_and_old_programs_write_them(tmp_path):

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -47,6 +48,16 @@ def two(tmp_path) -> list[Path]:
 def joined(path: Path) -> dict[str, str]:
     with CloudsReader(path) as reader:
         return {name: reader.class_names[label] for name, label in zip(reader.names, reader.labels)}
+
+
+def test_a_merge_of_files_that_changed_since_is_another_one(tmp_path):
+    paths = [write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"]) for k in range(2)]
+    merge(paths, tmp_path / "all.h5")
+    assert merge(paths, tmp_path / "all.h5").was_complete
+    with h5py.File(paths[1], "r+") as file:
+        file["points"][:1] += 1
+    with pytest.raises(UsageError, match="exists, made with another file 2"):
+        merge(paths, tmp_path / "all.h5")
 
 
 def test_files_of_equal_classes_follow_one_another(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -172,6 +173,24 @@ def test_the_same_command_again_finds_its_work_done(whole, tmp_path, monkeypatch
     first, again = dpc(*command), dpc(*command)
     assert first.returncode == again.returncode == 0 and first.stdout == again.stdout
     assert "already complete" in again.stderr and "already complete" not in first.stderr
+
+
+@pytest.mark.parametrize("changed", ["c.h5", "list.csv"])
+@pytest.mark.parametrize("output", ["d", "new.h5"])
+def test_what_was_made_of_another_file_of_that_name_is_not_taken_for_this_one_s(
+    whole, tmp_path, monkeypatch, output, changed
+):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(whole, "c.h5")
+    Path("list.csv").write_text("s00,train\ns01,test\n")
+    split(Path("c.h5"), Path(output), SplitChoice(listed=Path("list.csv")))
+    if changed == "c.h5":
+        with h5py.File("c.h5", "r+") as file:
+            file["points"][:3] += 1
+    else:
+        Path("list.csv").write_text("s00,test\ns01,train\n")
+    with pytest.raises(UsageError, match=f"exists, made with another {'clouds' if changed == 'c.h5' else 'list'} file"):
+        split(Path("c.h5"), Path(output), SplitChoice(listed=Path("list.csv")))
 
 
 def test_subjects_stay_together(whole, tmp_path):

@@ -58,6 +58,16 @@ def test_a_command_that_fails_deletes_no_network(dpc_here, data, run_folder, tmp
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before, more
 
 
+def test_a_finished_run_needs_its_flows_no_more(dpc_here, data, run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    for flows in folder.glob("*.npy"):
+        flows.unlink()
+    before = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
+    again = dpc_here("segment", "train", data, "-o", folder, *TRAIN)
+    assert again.returncode == 0 and b"is finished already" in again.stderr
+    assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == before
+
+
 def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, dpc_here, tmp_path):
     """SIGTERM saves and exits 75; kill -9 loses what came after the last checkpoint; weights and flows come out equal."""
     folder = tmp_path / "killed"

@@ -161,6 +161,21 @@ def test_a_link_to_a_folder_is_written_through(tmp_path):
     assert sorted(os.listdir(tmp_path / "out")) == ["d", "e"]
 
 
+def test_a_link_to_a_file_is_replaced_and_told(tmp_path, capsys):
+    """Who reads what it led to would else take the old content for the new one."""
+    old, link = tmp_path / "old.h5", tmp_path / "link.h5"
+    old.write_bytes(b"old")
+    link.symlink_to(old)
+    with AtomicFile(link) as file:
+        file["a"] = 1
+    assert old.read_bytes() == b"old" and not link.is_symlink()
+    told = f"dpc: warning: {link}: was a link and is a file now; {old}, where it led to, is as it was\n"
+    assert capsys.readouterr().err == told
+    with whole_file(link) as part:
+        part.write_bytes(b"new")
+    assert link.read_bytes() == b"new" and capsys.readouterr().err == ""
+
+
 def test_the_current_folder_is_not_replaced(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in (".", str(tmp_path), f"../{tmp_path.name}"):
