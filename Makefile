@@ -98,8 +98,9 @@ FRAMES    ?= 4,8,12,16,24
 FROM      ?= 16
 FOLDS     ?= 10
 FLOW      ?= icp
-needs      = $(if $(strip $($(1))),,$(error make $@ needs $(1)=folder, $(2)))
-needs_either = $(if $(strip $(NVGESTURE)$(MSRACTION)),,$(error make $@ needs NVGESTURE=folder or MSRACTION=folder))
+# needs-GOAL stops make where GOAL lacks its data. The last line reads it of each goal asked for, before .venv takes minutes.
+needs      = $(if $(strip $($(1))),,$(error make $(goal) needs $(1)=folder, $(2)))
+needs_either = $(if $(strip $(NVGESTURE)$(MSRACTION)),,$(error make $(goal) needs NVGESTURE=folder or MSRACTION=folder))
 MSR_IS    := the folder of MSRAction-3D's depth videos
 GLB_IS    := a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it
 NV_IS     := the folder of NvGesture's lists and Video_data
@@ -108,41 +109,42 @@ PLAN       = --preset $(PRESET) --seeds "$(SEEDS)" $(if $(CLIPS),--clips $(CLIPS
 CHAIN      = --from "$(FROM)" $(if $(MORE),--more="$(MORE)")
 TABLES    := $(BIN)/python -m dpcli.reproduce
 
+needs-table-3.1 = $(call needs_either)
 table-3.1: $(READY)
-	$(call needs_either)
 	$(TABLES).table_3_1 $(EITHER) table/3.1 $(if $(MODELNET),--modelnet "$(MODELNET)") \
 	    $(if $(PRETRAIN),--pretrain="$(PRETRAIN)") $(PLAN) -- $(BUDGET)
 
+needs-table-3.2 = $(call needs,NVGESTURE,$(NV_IS))
 table-3.2: $(READY)
-	$(call needs,NVGESTURE,$(NV_IS))
 	$(TABLES).accuracy_tables 3.2 "$(NVGESTURE)" table/3.2 $(PLAN) -- $(BUDGET)
 
+needs-table-3.3 = $(call needs,SHREC17,the folder of train_gestures.txt and gesture_1 ...)
 table-3.3: $(READY)
-	$(call needs,SHREC17,the folder of train_gestures.txt and gesture_1 ...)
 	$(TABLES).accuracy_tables 3.3 "$(SHREC17)" table/3.3 $(PLAN) -- $(BUDGET)
 
+needs-table-3.4 = $(call needs,MSRACTION,$(MSR_IS))
 table-3.4: $(READY)
-	$(call needs,MSRACTION,$(MSR_IS))
 	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only "$(FRAMES)" $(CHAIN) $(PLAN) -- $(BUDGET)
 
+needs-table-3.5 = $(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)
 table-3.5: $(READY)
-	$(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)
 	$(TABLES).accuracy_tables 3.5 "$(NTU60)" table/3.5 $(PLAN) -- $(BUDGET)
 
 # SWEEPS: "group_size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out. ONLY=0,1: these folds.
+needs-figure-3.5 = $(call needs_either)
 figure-3.5: $(READY)
-	$(call needs_either)
 	$(TABLES).figure_3_5 $(EITHER) table/figure-3.5 --preset $(PRESET) --folds $(FOLDS) --only "$(ONLY)" \
 	    $(foreach sweep,$(SWEEPS),--sweep $(sweep)) $(if $(PREPARE),--prepare="$(PREPARE)") -- $(BUDGET)
 
 # FLOW: icp, nearest, or a folder that `dpc segment flow` made. PROFILE=only: without data, without accuracies.
+needs-figure-3.8 = $(if $(filter only,$(PROFILE)),,$(if $(MSRACTION),,$(error make $(goal) needs MSRACTION=folder, $(MSR_IS); or PROFILE=only)))
+needs-table-A.1 = $(needs-figure-3.8)
 figure-3.8 table-A.1: $(READY)
-	$(if $(filter only,$(PROFILE)),,$(if $(MSRACTION),,$(error make $@ needs MSRACTION=folder, $(MSR_IS); or PROFILE=only)))
 	$(TABLES).figure_3_8 "$(or $(MSRACTION),-)" table/figure-3.8 --flow "$(FLOW)" $(if $(BACKBONES),--backbones $(BACKBONES)) \
 	    $(if $(filter only,$(PROFILE)),--profile-only) $(PLAN) -- $(BUDGET)
 
+needs-figure-A.4 = $(call needs,MSRACTION,$(MSR_IS))
 figure-A.4: $(READY)
-	$(call needs,MSRACTION,$(MSR_IS))
 	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only 16 $(PLAN) -- $(BUDGET)
 	$(TABLES).figure_a_4 table/figure-A.4 table/3.4/$(PRESET)-16-seed*/scores.h5 \
 	    --flow table/figure-3.8/pointnet2/$(PRESET)-two-streams-seed*.h5
@@ -156,8 +158,8 @@ MADE_OF := --test-categories $(HELD) --fractions 1,0,0
 T42_TRAIN ?= --validation 0.03 --epochs 6 --batch 4 --lr 0.0015 \
     --set motion_after=0.4 --set update_after=0.5 --set consensus_after=0.6
 
+needs-table-4.2 = $(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 table-4.2: $(READY)
-	$(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 	mkdir -p $(T42)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
@@ -175,21 +177,21 @@ table-4.2: $(READY)
 	cat $(T42)/table.md
 
 # Actions found in long recordings made of MSR-Action3D's test videos; SEGMENTS: words for the program.
+needs-segments = $(call needs,MSRACTION,$(MSR_IS))
 segments: $(READY)
-	$(call needs,MSRACTION,$(MSR_IS))
 	$(TABLES).segments "$(MSRACTION)" table/segments $(SEGMENTS)
 
 # Fine-tuning on classes never seen; FEW: words for the program, such as "--videos 5,10 -- --preset tiny --timing uniform".
+needs-few-videos = $(call needs,MSRACTION,$(MSR_IS))
 few-videos: $(READY)
-	$(call needs,MSRACTION,$(MSR_IS))
 	mkdir -p table/few-videos
 	$(DPC) prepare msraction3d "$(MSRACTION)" -o table/few-videos/clouds.h5 --points 1024
 	$(TABLES).few_videos table/few-videos/clouds.h5 table/few-videos $(FEW)
 
 # Table 4.1: the switches of training, one after the other, with the same budget. Stopped, it goes on where it was.
 T41 := table/4.1
+needs-table-4.1 = $(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 table-4.1: $(READY)
-	$(call needs,SAPIEN,a folder of CATEGORY/ID/mobility.urdf)
 	mkdir -p $(T41)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
@@ -197,46 +199,46 @@ table-4.1: $(READY)
 
 # Table 4.3 on new rooms of the models below MESHES, or on OGC-DR and OGC-DRSV in the folder OGC; T43: words for the program.
 OGC ?=
+needs-table-4.3 = $(if $(MESHES)$(OGC),,$(error make $(goal) needs MESHES=folder, models to furnish rooms with, or OGC=folder, with OGC-DR and OGC-DRSV in it))
 table-4.3: $(READY)
-	$(if $(MESHES)$(OGC),,$(error make table-4.3 needs MESHES=folder, models to furnish rooms with, or OGC=folder, with OGC-DR and OGC-DRSV in it))
 	$(TABLES).table_4_3 table/4.3 $(if $(OGC),--ogc "$(OGC)",--meshes "$(MESHES)") $(T43)
 
 # Tables 4.4 to 4.6, objects of KITTI's streets; T44, T45, T46: words for the program. Stopped, they go on where they were.
+needs-table-4.4 = $(if $(KITTI_SF),,$(error make $(goal) needs KITTI_SF=folder, with training/disp_occ_0, flow_occ, instance, ... in it))
 table-4.4: $(READY)
-	$(if $(KITTI_SF),,$(error make table-4.4 needs KITTI_SF=folder, with training/disp_occ_0, flow_occ, instance, ... in it))
 	$(TABLES).street_tables table/4.4 --kitti-sf "$(KITTI_SF)" $(T44)
 
+needs-table-4.5 = $(if $(KITTI_DET),,$(error make $(goal) needs KITTI_DET=folder, with training/velodyne, label_2, calib in it))
 table-4.5: $(READY)
-	$(if $(KITTI_DET),,$(error make table-4.5 needs KITTI_DET=folder, with training/velodyne, label_2, calib in it))
 	$(TABLES).street_tables table/4.5 --kitti-det "$(KITTI_DET)" $(T45)
 
+needs-table-4.6 = $(call needs,SEMANTICKITTI,with dataset/sequences/00 ... 10 in it)
 table-4.6: $(READY)
-	$(call needs,SEMANTICKITTI,with dataset/sequences/00 ... 10 in it)
 	$(TABLES).street_tables table/4.6 --semantickitti "$(SEMANTICKITTI)" $(T46)
 
 # Table 5.1 on ARTEMIS' animals (ARTEMIS names their folder) or on animated meshes; T51: words for the program.
 MESHES ?=
 ARTEMIS ?=
+needs-table-5.1 = $(if $(MESHES)$(ARTEMIS),,$(error make $(goal) needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
 table-5.1: $(READY)
-	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
 	$(TABLES).scenes.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files; T52: words for the program. Stopped, it
 # goes on where it was.
+needs-table-5.2 = $(call needs,MESHES,$(GLB_IS))
 table-5.2: $(READY)
-	$(call needs,MESHES,$(GLB_IS))
 	$(TABLES).scenes.table_5_2 "$(MESHES)" table/5.2 $(T52)
 
 # Figure 5.3 of the thesis on the same clips: the number of control points, and the weight of temporal preservation.
+needs-figure-5.3 = $(call needs,MESHES,$(GLB_IS))
 figure-5.3: $(READY)
-	$(call needs,MESHES,$(GLB_IS))
 	$(TABLES).scenes.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
 HELD_OUT := dpcli/reproduce/scenes/held_out_models.txt
 PRIOR ?= --set bfloat16=true
+needs-prior = $(call needs,MESHES,a folder with the models of $(HELD_OUT) and many others below it)
 prior: $(READY)
-	$(call needs,MESHES,a folder with the models of $(HELD_OUT) and many others below it)
 	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
 	$(TABLES).scenes.prior_sides "$(MESHES)" prior --models prior/run
 
@@ -274,3 +276,5 @@ lint: $(READY)
 clean:
 	rm -rf $(VENV) demo fuzz soak build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(foreach goal,$(MAKECMDGOALS),$(needs-$(goal)))
