@@ -165,8 +165,8 @@ def _follow(
             made = predictor.add(points)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
-    except BrokenPipeError:  # nothing reads the lines any more
-        raise
+    except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
+        return error
     except (DpcError, OSError, KeyboardInterrupt) as error:
         problem = error
     finally:
