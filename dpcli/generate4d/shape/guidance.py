@@ -32,8 +32,9 @@ class ShapeGuidance:
 
     @property
     def confidence(self) -> float:
-        """Returns the median of the frames' confidence, 0..1."""
-        return float(np.median([frame.confidence for frame in self.layers]))
+        """Returns the median confidence, 0..1, of the frames that show the object, of all where none does."""
+        shown = [frame.confidence for frame in self.layers if frame.presence.any()]
+        return float(np.median(shown or [frame.confidence for frame in self.layers]))
 
     @property
     def depth_share(self) -> float:

@@ -52,6 +52,14 @@ def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, target
     assert found.name == name and said in capsys.readouterr().err
 
 
+def test_empty_frames_have_no_say(targets, tmp_path):
+    """Of a creature that is in less than half of the clip the network knows as much as of one that stays."""
+    weights = _weights(tmp_path / "w.safetensors", 2.0)
+    pictures = torch.cat([targets.pictures, torch.zeros_like(targets.pictures), torch.zeros_like(targets.pictures)], 1)
+    found = guide("auto", replace(targets, pictures=pictures, seconds=np.arange(6.0)), weights)
+    assert (found.name, round(found.confidence, 2)) == ("network", 0.88)
+
+
 class Bar:
     """A prior of one bar along the line of sight, from 2 to 3 away, as wide as the picture's middle half."""
 
