@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 from tests.support.browser import needs_browser, open_page
 from tests.support.commands import exit_code
-from tests.support.scenes import toy_scene
+from tests.support.scenes import in_unit, toy_scene
 
 _FLAGS = "--use-angle=swiftshader --enable-unsafe-swiftshader --virtual-time-budget=8000 --window-size=640,480".split()
 # A browser without a screen draws few frames by itself; the page's clock ticks all the same
@@ -87,6 +88,21 @@ def test_a_link_holds_the_view(page, tmp_path):
     assert (seen["azimuth"], seen["elevation"], seen["radius"]) == pytest.approx((1, 0.3, 2.5), abs=1e-4)
     assert seen["target"] == [0.1, 0.2, -0.3] and seen["time"] == pytest.approx(0.1)
     assert (seen["color"], seen["background"], seen["trails"], seen["bounce"]) == ("part", "black", True, True)
+
+
+@needs_browser
+def test_a_link_holds_the_view_of_a_small_world_and_of_a_fast_clip(tmp_path):
+    """In units of the scene, four digits after the point would be none: of a grain in meters, of 20,000 frames a second."""
+    small = in_unit(replace(toy_scene(frames=5), time=np.arange(5) / 20_000), 1e-5)
+    write_page(small, tmp_path / "small.html", title="small")
+    script = """app.change({ radius: 1.2345e-5, target: [1.25e-6, 0, -2.5e-6], time: app.timeline.times[3] });
+      const [x, y] = projected(app.scene.placeAt(0, 3), app.camera);
+      const address = app.address, seen = app.scene.seenAt(x, y, app.camera, new Set());
+      history.replaceState(null, "", address); app.change({ ...app.home(), time: 0 }); app.readAddress(); return { ...app.state, seen };"""
+    state = _run(tmp_path / "small.html", script, tmp_path, "time=0")
+    assert state["radius"] == pytest.approx(1.2345e-5, rel=1e-4) and state["seen"] is not None
+    assert state["target"] == pytest.approx([1.25e-6, 0, -2.5e-6], abs=1e-9)
+    assert state["time"] == pytest.approx(3 / 20_000, abs=1e-6)
 
 
 @needs_browser
