@@ -121,6 +121,8 @@ class App extends Stage {
     const { header } = this, panel = $("panel");
     const rows = Object.entries({ ...header.metrics, "control points": header.control_points, "made by": `dpc ${header.version}` });
     const add = (tag, text, into = panel) => { const element = made(tag, text); into.append(element); return element; };
+    add("button", "close").className = "close";  // a small screen's panel covers the button that opened it
+    panel.firstChild.onclick = () => { panel.hidden = true; };
     add("h2", "Measured");
     const table = add("table", "");
     for (const [name, value] of rows) {

@@ -176,6 +176,18 @@ def test_keys_do_what_the_list_says(page, tmp_path):
 
 
 @needs_browser
+def test_the_panel_closes_without_keys(page, tmp_path):
+    """On a phone, which has none, the panel covers the button that opened it."""
+    script = """
+      $("about").click();
+      const close = $("panel").querySelector("button"), { x, y, width, height } = close.getBoundingClientRect();
+      const found = [$("panel").hidden, document.elementFromPoint(x + width / 2, y + height / 2) === close];
+      close.click();
+      return [...found, $("panel").hidden];"""
+    assert _run(page, script, tmp_path) == [False, True, True]
+
+
+@needs_browser
 def test_back_and_forth_turns_at_both_ends(page, tmp_path):
     script = """const line = new Timeline([0, 1, 2], 1, 1), moves = [[1.5, 1, 1], [0.5, 1, -1], [1, 0.25, 1], [1, 100, 1]];
       return moves.map((move) => line.bounced(...move));"""
