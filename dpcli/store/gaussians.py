@@ -191,7 +191,10 @@ class GaussianScene:
             yield f"reference is camera {self.reference}, expected 0..{len(self.camera_intrinsics) - 1}"
         lenses = self.camera_intrinsics
         if (lenses[:, [0, 1], [0, 1]] <= 0).any() or (lenses[:, 2] != [0, 0, 1]).any():
-            yield "camera_intrinsics holds a camera that is not [[fx s cx] [0 fy cy] [0 0 1]], fx, fy > 0"
+            yield "camera_intrinsics holds a camera that is not [[fx 0 cx] [0 fy cy] [0 0 1]], fx, fy > 0"
+        # as of views: one that shifts the ends of the picture by more than half a pixel
+        elif (np.abs(lenses[:, [0, 1], [1, 0]]) * max(self.size, default=0) > lenses[:, [0, 1], [0, 1]]).any():
+            yield "camera_intrinsics holds a camera with a skew; expected pixels that are rectangles, since nothing draws others"
         if len(self.size) != 2 or min(self.size) < 1:
             yield f"size is {self.size}, expected (width, height) in pixels"
         try:
