@@ -105,6 +105,14 @@ class Targets:
                 f" the fit will suffer; {advice} (for a clip, --radius and --fovy of `dpc prepare video` say where the camera is)"
             )
 
+    def check_cut_out(self, where: object) -> None:
+        """Warns of a reference view that is opaque all over in every frame: a fit knows the object by its alpha alone."""
+        if self.pictures[self.reference, ..., 3].amin() > 0.5:
+            log.warn(
+                f"{where}: alpha is full all over every picture of the reference view, so the background is fitted as part of"
+                " the object; cut the object out (`dpc prepare video` does), unless this is meant"
+            )
+
     def picture(self, view: int, frame: int) -> np.ndarray:
         """Returns a picture f32 (H,W,4) with straight color, 0..1."""
         value = self.pictures[view, frame].float().numpy().copy()

@@ -21,6 +21,7 @@ from dpcli.text_files import parse_json
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _LARGEST_LOG_SCALE = 40  # so that a scale, and its square in a covariance, stay finite in float32
+_NEAR, _NEAR_SHARE = 0.01, 0.02  # depth that 3DGS draws from; the same in half the extent of a scene in a small unit
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
 LAYOUT = {field.name: (field.dtype, field.shape) for field in TABLES["gaussians"]}  # data set -> type, shape
 _QUATERNIONS = ("quaternion", "frame_quaternion", "control_quaternion")
@@ -95,6 +96,13 @@ class GaussianScene:
     def color(self) -> np.ndarray:
         """Returns the color that doesn't depend on the direction, u8 (N,3)."""
         return color_of(self.sh)
+
+    @property
+    def near(self) -> float:
+        """Returns the least depth at which a camera sees a Gaussian: that of 3DGS, and less where the whole scene is small."""
+        extent = np.ptp(self.frame_mean.reshape(-1, 3).astype(np.float64), axis=0)
+        reach = float(np.linalg.norm(extent)) / 2 + float(self.scale.max())
+        return min(_NEAR, max(_NEAR_SHARE * reach, float(np.finfo(np.float32).tiny)))
 
     def require_times(self, asked: np.ndarray, path: object, asker: str) -> None:
         """Raises DataError where times f64 (n), seconds, lie outside the clip by more than half a frame: nothing is known then.
@@ -183,7 +191,10 @@ class GaussianScene:
             yield f"reference is camera {self.reference}, expected 0..{len(self.camera_intrinsics) - 1}"
         lenses = self.camera_intrinsics
         if (lenses[:, [0, 1], [0, 1]] <= 0).any() or (lenses[:, 2] != [0, 0, 1]).any():
-            yield "camera_intrinsics holds a camera that is not [[fx s cx] [0 fy cy] [0 0 1]], fx, fy > 0"
+            yield "camera_intrinsics holds a camera that is not [[fx 0 cx] [0 fy cy] [0 0 1]], fx, fy > 0"
+        # as of views: one that shifts the ends of the picture by more than half a pixel
+        elif (np.abs(lenses[:, [0, 1], [1, 0]]) * max(self.size, default=0) > lenses[:, [0, 1], [0, 1]]).any():
+            yield "camera_intrinsics holds a camera with a skew; expected pixels that are rectangles, since nothing draws others"
         if len(self.size) != 2 or min(self.size) < 1:
             yield f"size is {self.size}, expected (width, height) in pixels"
         try:

@@ -148,6 +148,16 @@ def test_a_world_of_another_unit_or_origin_is_told(scale, shift, told, tmp_path,
         targets.check_world("views.h5")
 
 
+def test_pictures_that_nobody_cut_out_are_told(tmp_path, capsys):
+    targets = fit._load(toy_views(tmp_path / "views.h5"), FitConfig(size=32), Supervision())
+    targets.pictures[0, 1:, ..., 3] = 1
+    targets.check_cut_out("views.h5")
+    assert not capsys.readouterr().err
+    targets.pictures[0, 0, ..., 3] = 1
+    targets.check_cut_out("views.h5")
+    assert "views.h5: alpha is full all over every picture of the reference view" in capsys.readouterr().err
+
+
 def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
     """A ball seen once, which is a ball from the side as well, neither a cloud behind it nor a splinter."""
     path = tmp_path / "ball.h5"

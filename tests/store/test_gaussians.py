@@ -92,6 +92,8 @@ def _changed(key, change):
         ("control_radius", lambda v: v.__setitem__(1, 0), "control_radius holds 0"),
         ("part_motion", lambda v: v[3, 1, :3, :3].__imul__(1.05), r"part_motion\[3, 1\] is not rigid"),
         ("part_motion", lambda v: v[3, 1, 0, :3].__imul__(-1), r"part_motion\[3, 1\]"),  # a mirror
+        ("camera_intrinsics", lambda v: v.__setitem__((1, 0, 1), 5.0), "camera_intrinsics holds a camera with a skew"),
+        ("camera_intrinsics", lambda v: v.__setitem__((1, 1, 0), 5.0), "camera_intrinsics holds a camera with a skew"),
         ("camera_world_to_camera", lambda v: v[1, 3].fill(1), r"camera_world_to_camera\[1\]"),
     ],
 )

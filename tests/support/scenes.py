@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
@@ -59,3 +61,15 @@ def toy_scene(
         reference=0,
         metrics={"psnr": 31.5},
     )
+
+
+def in_unit(scene: GaussianScene, unit: float) -> GaussianScene:
+    """The same scene with lengths `unit` times as large, its cameras as far away."""
+    poses = scene.camera_world_to_camera.copy()
+    poses[:, :3, 3] *= unit
+    names = ("mean", "frame_mean", "control_point", "control_radius", "control_position")
+    lengths = {name: getattr(scene, name) * np.float32(unit) for name in names}
+    motion = scene.part_motion.copy()
+    motion[..., :3, 3] *= np.float32(unit)
+    sizes = scene.log_scale + np.float32(np.log(unit))
+    return replace(scene, **lengths, part_motion=motion, log_scale=sizes, camera_world_to_camera=poses)

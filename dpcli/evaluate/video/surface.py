@@ -98,7 +98,8 @@ def visible_points(scene: GaussianScene, time: float, around: np.ndarray) -> np.
     arrays = (means, turns, scene.scale, scene.opacity, scene.sh, poses, lenses)
     tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays)
     with torch.no_grad():
-        depth, alpha, _ = rasterization(*tensors, SIDE, SIDE, sh_degree=scene.sh_degree, render_mode="ED")
+        options = {"near_plane": scene.near, "sh_degree": scene.sh_degree, "render_mode": "ED"}
+        depth, alpha, _ = rasterization(*tensors, SIDE, SIDE, **options)
     return _unproject(depth[..., 0].double().numpy(), alpha[..., 0].numpy() >= 0.5, poses, lens)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.evaluate.results import LeftOut, list_names
 from dpcli.evaluate.video.protocol import VideoProtocol
@@ -30,6 +31,12 @@ def match_views(
     not_predicted = [truth.views[i].title for i in compared if partners[i] is None]
     used = {_partner_view(predicted, truth, i) for i in range(len(truth.views))}
     unknown = [view.title for i, view in enumerate(predicted.views) if i not in used]
+    by_camera = predicted.header is not None and truth.header is not None
+    if by_camera and len(not_predicted) == len(compared) and not intersect:
+        raise DataError(
+            f"{predicted.path}: no camera of its {counted(len(predicted.views), 'view')} stands, looks and sees as one of"
+            f" {truth.path}, by which views are matched; is the world moved, or in another unit?"
+        )
     if not_predicted and not intersect:
         raise DataError(
             f"{predicted.path}: has no view {list_names(not_predicted)} of {truth.path}; its views are "

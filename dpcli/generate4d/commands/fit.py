@@ -72,6 +72,7 @@ def fit_scene(
             return
         targets = _load(path, config, supervision)
         targets.check_world(views)
+        targets.check_cut_out(views)
         if targets.num_views > 1:
             check_cameras(targets, views)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)

@@ -43,7 +43,7 @@ class Renderer:
         self._parts = self._tensor(part_colors(scene.part) / 255)
         low, high = scene.frame_mean.min((0, 1)), scene.frame_mean.max((0, 1))
         self._center, self._reach = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        self._trails = _trail_points(scene)
+        self._near, self._trails = scene.near, _trail_points(scene)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.float32(values), device=self.device)
@@ -72,6 +72,7 @@ class Renderer:
             self._tensor(shot.world_to_camera)[None],
             self._tensor(shot.intrinsics)[None],
             *shot.size,
+            near_plane=self._near,
             **options,
         )
         drawn, alpha = drawn[0].cpu().numpy(), alpha[0].cpu().numpy()
@@ -92,7 +93,7 @@ class Renderer:
     def _depth_colors(self, depth: np.ndarray, shot: Shot) -> np.ndarray:
         """Returns colors f32 (H,W,3), 0..1, near bright and far dark, in one scale for all pictures of this distance."""
         middle = float((shot.world_to_camera[:3, :3] @ self._center + shot.world_to_camera[:3, 3])[2])
-        return weight_colors(0.5 - (depth - middle) / (2 * max(self._reach, 1e-6))).astype(np.float32) / 255
+        return weight_colors(0.5 - (depth - middle) / (2 * max(self._reach, 1e-30))).astype(np.float32) / 255
 
     def _with_trails(self, image: np.ndarray, shot: Shot) -> np.ndarray:
         import cv2
@@ -101,7 +102,7 @@ class Renderer:
         tracks, colors = self._trails
         first = max(0, a - max(2, round(_TRAIL_SHARE * self.scene.num_frames)))
         now = (1 - w) * tracks[a] + w * tracks[b]
-        pixels, ahead = _project(np.concatenate([tracks[first : a + 1], now[None]]), shot)
+        pixels, ahead = _project(np.concatenate([tracks[first : a + 1], now[None]]), shot, self._near)
         image, thick = np.ascontiguousarray(image), max(1, round(max(shot.size) / 300))
         for track in range(tracks.shape[1]):
             if not ahead[:, track].all():
@@ -129,10 +130,13 @@ def _trail_points(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
     return scene.frame_mean[:, chosen], (part_colors(scene.part[chosen]) * _TRAIL_SHADE).astype(np.uint8)
 
 
-def _project(points: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the pixels (...,2) of world points (...,3), corners at integers as OpenCV draws them, and which are ahead, bool (...)."""
+def _project(points: np.ndarray, shot: Shot, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the pixels (...,2) of world points (...,3), corners at integers as OpenCV draws them, and which are ahead, bool (...).
+
+    near: the least depth of what is ahead.
+    """
     camera = points @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
-    ahead = camera[..., 2] > 1e-3
+    ahead = camera[..., 2] > near
     image = camera @ shot.intrinsics.T
     return image[..., :2] / np.where(ahead, image[..., 2], 1)[..., None] - 0.5, ahead
 

@@ -21,6 +21,8 @@ from dpcli.generate4d.targets import Targets
 from dpcli.runtime.progress import log
 
 _ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
+# of the sphere they are drawn from; of the rays' distances from the origin beyond which the object leaves it
+_SPHERE, _WITHIN = 0.85, 0.8
 # pixels of a silhouette, and places on the ray of each, that other silhouettes are asked about
 _RAYS, _STEPS = (400, 192)
 _SHARED = 0.95  # of a silhouette, at least, lies within all others where their cameras are right
@@ -125,8 +127,12 @@ def carve_hull(
     pairs = list(zip(*np.nonzero(np.triu(across))))
     masked = [np.dstack([picture[..., 3], _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
     kept: list[np.ndarray] = []
+    reach = max(_ray_reach(picture[..., 3] > 0.5, *camera) for picture, *camera in zip(pictures, intrinsics, poses))
+    radius = (
+        _SPHERE if reach <= _WITHIN else np.sqrt(2) * reach
+    )  # two views at a right angle may both look along a diagonal
     for _ in range(_ROUNDS):
-        points = sample_sphere(_CANDIDATES, 0.85, rng)
+        points = sample_sphere(_CANDIDATES, radius, rng)
         seen = np.stack(
             [
                 _sample_picture(picture, points, matrix, pose)[0]
@@ -143,6 +149,14 @@ def carve_hull(
     if not len(points):
         raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
     return points, _mean_colors(points, pictures, intrinsics, poses)
+
+
+def _ray_reach(mask: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray) -> float:
+    """Returns how far from the world's origin the rays of a silhouette pass at most; the object reaches at least as far."""
+    row, column = np.nonzero(mask)
+    rays = Camera(intrinsics, pose).pixel_points(row, column, np.ones(len(row)))
+    away = np.linalg.norm(np.cross(rays, pose[:3, 3]), axis=1) / np.linalg.norm(rays, axis=1)
+    return float(away.max(initial=0.0))
 
 
 def _mean_colors(

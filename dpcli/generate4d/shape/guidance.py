@@ -14,6 +14,7 @@ from dpcli.generate4d.shape.splats import Splats, splats_of
 from dpcli.generate4d.targets import Targets
 
 SIDE = 128  # pixels at most of the pictures that a prior looks at in a fit
+_OBLONG = 1.02  # pixels that are longer one way by less are taken for squares
 _OUTERMOST = 0.01, 0.99  # quantiles of points that lie at the ends of an object
 
 
@@ -32,8 +33,9 @@ class ShapeGuidance:
 
     @property
     def confidence(self) -> float:
-        """Returns the median of the frames' confidence, 0..1."""
-        return float(np.median([frame.confidence for frame in self.layers]))
+        """Returns the median confidence, 0..1, of the frames that show the object, of all where none does."""
+        shown = [frame.confidence for frame in self.layers if frame.presence.any()]
+        return float(np.median(shown or [frame.confidence for frame in self.layers]))
 
     @property
     def depth_share(self) -> float:
@@ -53,13 +55,24 @@ class ShapeGuidance:
 
 
 def reference_pictures(targets: Targets, side: int) -> tuple[np.ndarray, Camera]:  # [T, 4, H, W]
-    """Returns the reference view f32 RGBA of straight color, 0..1, at most `side` pixels long, and its camera."""
-    shrink = max(1, round(max(targets.size) / side))
+    """Returns the reference view f32 RGBA of straight color, 0..1, about `side` pixels long, and its camera.
+
+    Its pixels are as wide as high, whatever the clip's: a prior takes the thickness of things from distances in the picture.
+    """
+    focal = targets.intrinsics[targets.reference][[0, 1], [0, 1]]
+    share = focal.min() / focal if focal.max() > _OBLONG * focal.min() else np.ones(2)
+    shrink = max(1, round(max(share * targets.size) / side))
     frames = list(range(targets.num_frames))
     chosen, matrices, poses = targets.at([targets.reference] * len(frames), frames, shrink)
-    pictures = chosen.permute(0, 3, 1, 2).numpy()
+    pictures, lens = chosen.permute(0, 3, 1, 2), matrices[0].double().numpy()
+    if share.min() < 1:
+        height, width = pictures.shape[2:]
+        size = max(1, round(height * share[1])), max(1, round(width * share[0]))
+        pictures = torch.nn.functional.interpolate(pictures, size, mode="area")
+        lens = np.diag([size[1] / width, size[0] / height, 1.0]) @ lens
+    pictures = pictures.numpy()
     pictures[:, :3] /= np.maximum(pictures[:, 3:], 1e-3)
-    return pictures.clip(0, 1), Camera(matrices[0].double().numpy(), poses[0].double().numpy())
+    return pictures.clip(0, 1), Camera(lens, poses[0].double().numpy())
 
 
 def sample_surface(

@@ -123,6 +123,7 @@ def describe(
             "azimuth": azimuth,
             "elevation": elevation,
             "radius": radius,
+            "near": scene.near,
             "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
         },
         "parts": [

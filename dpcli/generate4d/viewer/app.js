@@ -27,6 +27,8 @@ class App extends Stage {
     this.fitCanvas();
   }
 
+  get camera() { return { ...super.camera, near: this.header.camera.near }; }
+
   home() {
     const { azimuth, elevation, radius } = this.header.camera;
     return { azimuth, elevation, radius, target: [0, 0, 0] };
@@ -53,11 +55,12 @@ class App extends Stage {
     this.change(values);
   }
 
-  // The address that shows what is shown now.
+  // The address that shows what is shown now; `unit`: what 4 digits are enough for, where it is less than 1.
   get address() {
-    const { state } = this, short = (value) => String(Number(value.toFixed(4)));
-    const values = { time: short(state.time), color: state.color, azimuth: short(state.azimuth / DEGREE), elevation: short(state.elevation / DEGREE),
-      radius: short(state.radius), target: state.target.map(short).join(","), background: state.background };
+    const { state } = this, short = (value, unit = 1) => String(Number(value.toFixed(Math.min(4 + Math.max(0, Math.ceil(-Math.log10(unit))), 100))));
+    const values = { time: short(state.time, 100 * this.timeline.tail), color: state.color, azimuth: short(state.azimuth / DEGREE),
+      elevation: short(state.elevation / DEGREE), radius: short(state.radius, state.radius),
+      target: state.target.map((value) => short(value, state.radius)).join(","), background: state.background };
     for (const flag of FLAGS) if (state[flag]) values[flag] = "1";
     return `${location.href.split("#")[0]}#${new URLSearchParams(values).toString().replaceAll("%2C", ",")}`;
   }
@@ -118,6 +121,8 @@ class App extends Stage {
     const { header } = this, panel = $("panel");
     const rows = Object.entries({ ...header.metrics, "control points": header.control_points, "made by": `dpc ${header.version}` });
     const add = (tag, text, into = panel) => { const element = made(tag, text); into.append(element); return element; };
+    add("button", "close").className = "close";  // a small screen's panel covers the button that opened it
+    panel.firstChild.onclick = () => { panel.hidden = true; };
     add("h2", "Measured");
     const table = add("table", "");
     for (const [name, value] of rows) {

@@ -29,14 +29,14 @@ class CanvasPainter {
   }
 
   draw(scene, order, rgba, camera, background) {
-    const { context } = this, { mean, covariance } = scene, { rotation: R, shift, focal, width, height } = camera;
+    const { context } = this, { mean, covariance } = scene, { rotation: R, shift, focal, width, height, near } = camera;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.globalAlpha = 1;
     context.fillStyle = `rgb(${background})`;
     context.fillRect(0, 0, width, height);
     for (const i of order) {
       const p = [0, 1, 2].map((k) => R[3 * k] * mean[3 * i] + R[3 * k + 1] * mean[3 * i + 1] + R[3 * k + 2] * mean[3 * i + 2] + shift[k]);
-      if (p[2] < 0.01 || rgba[4 * i + 3] < 2) continue;
+      if (p[2] < near || rgba[4 * i + 3] < 2) continue;
       const { axis, large, small } = this.ellipse(covariance.subarray(6 * i, 6 * i + 6), R, p, focal);
       const s = (2 * REACH) / BLOB, x = width / 2 + (focal * p[0]) / p[2], y = height / 2 + (focal * p[1]) / p[2];
       context.setTransform(axis[0] * large * s, axis[1] * large * s, -axis[1] * small * s, axis[0] * small * s, x, y);

@@ -86,12 +86,12 @@ class Scene {
 
   // The nearest Gaussian that covers a pixel, as a point [x, y, z]; null where none does. `moveTo` and `sorted` have run.
   seenAt(x, y, camera, hidden) {
-    const { mean, part, color, count, scale } = this, { rotation: R, shift, focal, width, height } = camera;
+    const { mean, part, color, count, scale } = this, { rotation: R, shift, focal, width, height, near } = camera;
     let nearest = Infinity, found = null;
     for (let i = 0; i < count; i++) {
       if (hidden.has(part[i]) || color[3 * count + i] < 76) continue;  // fainter than 0.3
       const [a, b, c] = mean.subarray(3 * i, 3 * i + 3), depth = R[6] * a + R[7] * b + R[8] * c + shift[2];
-      if (depth < 0.01 || depth >= nearest) continue;
+      if (depth < near || depth >= nearest) continue;
       const u = width / 2 + focal * (R[0] * a + R[1] * b + R[2] * c + shift[0]) / depth;
       const v = height / 2 + focal * (R[3] * a + R[4] * b + R[5] * c + shift[1]) / depth;
       const reach = Math.max(3, focal * Math.max(scale[i], scale[count + i], scale[2 * count + i]) / depth);

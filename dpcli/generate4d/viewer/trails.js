@@ -41,7 +41,7 @@ class Trails {
 }
 
 // The pixel of a point, or null behind the camera.
-function projected([a, b, c], { rotation: R, shift, focal, width, height }) {
+function projected([a, b, c], { rotation: R, shift, focal, width, height, near }) {
   const [x, y, z] = [0, 3, 6].map((k) => R[k] * a + R[k + 1] * b + R[k + 2] * c + shift[k / 3]);
-  return z < 0.01 ? null : [width / 2 + focal * x / z, height / 2 + focal * y / z];
+  return z < near ? null : [width / 2 + focal * x / z, height / 2 + focal * y / z];
 }

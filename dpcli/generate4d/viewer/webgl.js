@@ -3,13 +3,13 @@
 const VERTEX = `#version 300 es
 precision highp float;
 in vec2 corner; in vec3 center; in vec3 spreadA; in vec3 spreadB; in vec4 color;
-uniform mat3 rotation; uniform vec3 shift; uniform vec2 focal; uniform vec2 size;
+uniform mat3 rotation; uniform vec3 shift; uniform vec2 focal; uniform vec2 size; uniform float near;
 out vec2 place; out vec4 tint;
 void main() {
   vec3 p = rotation * center + shift;
   tint = color;
   float reach = sqrt(max(2.0 * log(255.0 * color.a), 0.0));
-  if (p.z < 0.01 || reach == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
+  if (p.z < near || reach == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
   vec2 limit = 1.3 * 0.5 * size / focal;
   vec2 t = clamp(p.xy / p.z, -limit, limit);
   mat3 jacobian = mat3(focal.x / p.z, 0.0, 0.0, 0.0, focal.y / p.z, 0.0, -focal.x * t.x / p.z, -focal.y * t.y / p.z, 0.0);
@@ -86,6 +86,7 @@ class GlPainter {
     gl.uniform3fv(uniform("shift"), camera.shift);
     gl.uniform2f(uniform("focal"), camera.focal, camera.focal);
     gl.uniform2f(uniform("size"), camera.width, camera.height);
+    gl.uniform1f(uniform("near"), camera.near);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, rows, 0, FLOATS * order.length);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);

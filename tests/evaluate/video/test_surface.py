@@ -118,3 +118,12 @@ def test_a_scene_shows_the_same_surface_wherever_it_stands():
         disk = 14 * np.pi * (SIDE / 2 / 1.4) ** 2
         assert disk < len(points) < 1.25 * disk
     assert len(here) == pytest.approx(len(there), rel=1e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_a_surface_has_the_same_errors_in_any_unit(unit):
+    one, other = (
+        surface_score(_ball(size), np.tile(_directions(500) * size, (2, 1, 1)), np.arange(2)) for size in (1, unit)
+    )
+    assert other.unseen == 0 and other.f_score == pytest.approx(one.f_score, abs=1e-3)
+    assert other.chamfer / unit == pytest.approx(one.chamfer, rel=1e-3)

@@ -20,7 +20,7 @@ from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 from tests.support.commands import told
-from tests.support.scenes import toy_scene
+from tests.support.scenes import in_unit, toy_scene
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +179,18 @@ def test_trails_follow_control_points_and_start_where_they_were(scene, renderer)
     bare = Renderer(toy_scene(per_part=120, size=48, controls=0))  # then Gaussians draw them
     assert (bare.picture(shot, Look(trajectories=True)) != plain).any()
     assert renderer.picture(shot, Look(trajectories=True, background=None)).shape == (48, 48, 4)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
+@pytest.mark.parametrize("color", ["appearance", "depth"])
+def test_a_scene_looks_the_same_in_any_unit(unit, color, scene, renderer):
+    """A world in meters of something as small as a grain has its camera nearer than a hundredth."""
+    look, other = Look(color, trajectories=True), in_unit(scene, unit)
+    here, there = (
+        drawn.picture(plan_shots(drawn.scene, "fixed", time=0.6)[0], look).astype(int)
+        for drawn in (renderer, Renderer(other))
+    )
+    assert (here != 255).any(-1).mean() > 0.1 and np.abs(here - there).max() <= 1
 
 
 def test_color_tables():

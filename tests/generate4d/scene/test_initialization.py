@@ -54,6 +54,20 @@ def test_the_hull_is_inside_every_silhouette_and_takes_the_near_color():
         carve_hull([_disc(64, 4), off], intrinsics, side, 100, RNG)
 
 
+@pytest.mark.parametrize("unit, away", [(1.0, 0.0), (2.5, 0.0), (1.0, 1.6), (1.0, -1.2)])
+def test_a_hull_is_found_wherever_and_however_large_the_object_is(unit, away):
+    """Four views of a ball; a world in another unit, or with the object beside its origin, moves the hull with it."""
+    intrinsics = np.stack([pinhole(np.deg2rad(49.1), 64, 64)] * 4)
+    poses = np.stack([orbit_pose(np.pi / 2 * turn, 0) for turn in range(4)])
+    middle = np.array([away, 0, 0])
+    poses[:, :3, 3] = unit * poses[:, :3, 3] - poses[:, :3, :3] @ middle
+    points, _ = carve_hull([_disc(64, 15)] * 4, intrinsics, poses, 800, np.random.default_rng(0))
+    assert len(points) == 800
+    np.testing.assert_allclose(points.mean(0), middle, atol=0.04 * unit)
+    half = 15 / intrinsics[0, 0, 0] * 2 * unit
+    assert np.percentile(np.linalg.norm(points - middle, axis=1), 99) == pytest.approx(half, rel=0.2)
+
+
 @pytest.mark.parametrize("alpha, views", [((1, 1, 1), 3), ((1, 0, 1), 2), ((1, 0.4, 0), 1), ((0.4, 0.2, 0), 0)])
 def test_a_view_that_the_object_has_left_carves_nothing(alpha, views):
     """Three views of a ball in the frame to start from; in some it isn't seen, or but faintly."""

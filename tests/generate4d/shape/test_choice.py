@@ -13,7 +13,7 @@ from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.optimizer import SceneOptimizer
 from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.shape.config import ShapeConfig
-from dpcli.generate4d.shape.guidance import ShapeGuidance
+from dpcli.generate4d.shape.guidance import ShapeGuidance, reference_pictures
 from dpcli.generate4d.shape.layers import ShapeLayers
 from dpcli.generate4d.shape.model_file import save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
@@ -52,6 +52,14 @@ def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, target
     assert found.name == name and said in capsys.readouterr().err
 
 
+def test_empty_frames_have_no_say(targets, tmp_path):
+    """Of a creature that is in less than half of the clip the network knows as much as of one that stays."""
+    weights = _weights(tmp_path / "w.safetensors", 2.0)
+    pictures = torch.cat([targets.pictures, torch.zeros_like(targets.pictures), torch.zeros_like(targets.pictures)], 1)
+    found = guide("auto", replace(targets, pictures=pictures, seconds=np.arange(6.0)), weights)
+    assert (found.name, round(found.confidence, 2)) == ("network", 0.88)
+
+
 class Bar:
     """A prior of one bar along the line of sight, from 2 to 3 away, as wide as the picture's middle half."""
 
@@ -68,6 +76,19 @@ def test_how_deep_an_object_is_beside_its_larger_side(targets):
     """The back of the bar is seen as large as its front and is farther away, so it is the larger side: 1 / (3 x 15 / f)."""
     focal = float(targets.intrinsics[0, 0, 0])
     assert ShapeGuidance(Bar(), targets).depth_share == pytest.approx(focal / 45, rel=0.03)
+
+
+@pytest.mark.parametrize("stretched", [(2, 1), (1, 3)])
+@pytest.mark.parametrize("prior", ["inflated", "network"])
+def test_pixels_that_are_no_squares_make_nothing_thinner(prior, stretched, targets):
+    across, down = stretched
+    lens = np.diag([across, down, 1.0]) @ targets.intrinsics[0]
+    pictures = targets.pictures.repeat_interleave(down, 2).repeat_interleave(across, 3)
+    oblong = replace(targets, pictures=pictures, intrinsics=lens[None])
+    (square, camera), (found, own) = (reference_pictures(given, 128) for given in (targets, oblong))
+    np.testing.assert_allclose(found, square, atol=1e-3)
+    np.testing.assert_allclose(own.intrinsics, camera.intrinsics)
+    assert guide(prior, oblong).depth_share == pytest.approx(guide(prior, targets).depth_share, rel=1e-2)
 
 
 def test_without_weights_auto_inflates_and_says_so(targets, tmp_path, monkeypatch, capsys):

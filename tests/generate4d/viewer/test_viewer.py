@@ -21,7 +21,7 @@ from dpcli.generate4d.viewer import packed, write_page
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
 from tests.support.browser import PRESSED, needs_browser, open_page
-from tests.support.scenes import toy_scene
+from tests.support.scenes import in_unit, toy_scene
 
 WIDTH, HEIGHT = 420, 320
 _FLAGS = (
@@ -100,15 +100,12 @@ def test_a_browser_draws_what_our_rasterizer_draws(scene, page, tmp_path):
 
 
 @needs_browser
-@pytest.mark.parametrize(("unit", "radius"), [(1000.0, 2000.0), (0.01, 0.02), (1.0, 150.0)])
+@pytest.mark.parametrize(("unit", "radius"), [(1000.0, 2000.0), (0.01, 0.02), (1e-5, 2e-5), (1.0, 150.0)])
 def test_a_page_opens_where_the_camera_stands(unit, radius, scene, tmp_path):
     """Of scenes in another unit, and of one seen from afar through a long lens."""
     pose, fovy = orbit_pose(0.4, 0.2, radius), 2 * np.arctan(np.tan(DEFAULT_FOVY / 2) * 2 * unit / radius)
     other = replace(
-        scene,
-        mean=scene.mean * np.float32(unit),
-        frame_mean=scene.frame_mean * np.float32(unit),
-        log_scale=scene.log_scale + np.float32(np.log(unit)),
+        in_unit(scene, unit),
         camera_world_to_camera=np.stack([pose] * 2),
         camera_intrinsics=np.stack([pinhole(fovy, *scene.size)] * 2),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 from tests.support.browser import needs_browser, open_page
 from tests.support.commands import exit_code
-from tests.support.scenes import toy_scene
+from tests.support.scenes import in_unit, toy_scene
 
 _FLAGS = "--use-angle=swiftshader --enable-unsafe-swiftshader --virtual-time-budget=8000 --window-size=640,480".split()
 # A browser without a screen draws few frames by itself; the page's clock ticks all the same
@@ -90,6 +91,21 @@ def test_a_link_holds_the_view(page, tmp_path):
 
 
 @needs_browser
+def test_a_link_holds_the_view_of_a_small_world_and_of_a_fast_clip(tmp_path):
+    """In units of the scene, four digits after the point would be none: of a grain in meters, of 20,000 frames a second."""
+    small = in_unit(replace(toy_scene(frames=5), time=np.arange(5) / 20_000), 1e-5)
+    write_page(small, tmp_path / "small.html", title="small")
+    script = """app.change({ radius: 1.2345e-5, target: [1.25e-6, 0, -2.5e-6], time: app.timeline.times[3] });
+      const [x, y] = projected(app.scene.placeAt(0, 3), app.camera);
+      const address = app.address, seen = app.scene.seenAt(x, y, app.camera, new Set());
+      history.replaceState(null, "", address); app.change({ ...app.home(), time: 0 }); app.readAddress(); return { ...app.state, seen };"""
+    state = _run(tmp_path / "small.html", script, tmp_path, "time=0")
+    assert state["radius"] == pytest.approx(1.2345e-5, rel=1e-4) and state["seen"] is not None
+    assert state["target"] == pytest.approx([1.25e-6, 0, -2.5e-6], abs=1e-9)
+    assert state["time"] == pytest.approx(3 / 20_000, abs=1e-6)
+
+
+@needs_browser
 def test_a_double_click_sets_the_pivot_on_what_is_seen(page, tmp_path):
     script = """
       const { width, height } = $("canvas"), found = [];
@@ -157,6 +173,18 @@ def test_keys_do_what_the_list_says(page, tmp_path):
     )
     assert {"space", "f", "l", "s", "double click, double tap"} <= set(seen["keys"])
     assert seen["saved"][0] == "toy_scene.png" and seen["saved"][1].startswith("blob:")
+
+
+@needs_browser
+def test_the_panel_closes_without_keys(page, tmp_path):
+    """On a phone, which has none, the panel covers the button that opened it."""
+    script = """
+      $("about").click();
+      const close = $("panel").querySelector("button"), { x, y, width, height } = close.getBoundingClientRect();
+      const found = [$("panel").hidden, document.elementFromPoint(x + width / 2, y + height / 2) === close];
+      close.click();
+      return [...found, $("panel").hidden];"""
+    assert _run(page, script, tmp_path) == [False, True, True]
 
 
 @needs_browser

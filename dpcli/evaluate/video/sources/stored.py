@@ -76,5 +76,5 @@ class SceneSource(Source):
         arrays = (*scene.at(time), scene.scale, scene.opacity, scene.sh, *cameras)
         with torch.no_grad():
             tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays)
-            colors, alphas, _ = rasterization(*tensors, width, height, sh_degree=scene.sh_degree)
+            colors, alphas, _ = rasterization(*tensors, width, height, near_plane=scene.near, sh_degree=scene.sh_degree)
         return torch.cat([colors[0, ..., :3], alphas[0]], -1).numpy()
