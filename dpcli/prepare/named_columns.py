@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickletools
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -14,9 +15,11 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables, told_units
+from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.column_names import (
     axes_in,
     find_axes,
+    find_colors,
     find_frame_column,
     find_trios,
     unit_of_attributes,
@@ -164,8 +167,10 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
         for group, own in groups.items():
             frames = find_frame_column(list(own))
             rows = max(own[frames].shape) if frames else 0
-            alike = {name: one for name, one in own.items() if rows and rows in (one.shape[0], one.size)}
-            columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in alike.items()}, {})
+            alike = {name: one for name, one in own.items() if rows and rows in (one.shape[0], math.prod(one.shape))}
+            plain = {list(alike)[place] for place in find_colors(list(alike))}  # which have no gaps
+            shown = {name: one if name in plain else with_gaps(one) for name, one in alike.items()}
+            columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in shown.items()}, {})
             if columns and _are_points(columns):
                 told = {name: told_units(one) for name, one in alike.items()}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}

@@ -16,6 +16,7 @@ import numpy as np
 from dpcli.errors import DataError, reading
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
 from dpcli.prepare.array_files.mat5 import read_variables
+from dpcli.prepare.array_files.netcdf_packing import unpacked
 from dpcli.prepare.array_files.safe_pickle import load_arrays
 
 if TYPE_CHECKING:
@@ -26,9 +27,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _ROWS_OF_CAMERA = 4  # of the largest arrays that tell of a camera, and of no points
-_MISSING = ("_FillValue", "missing_value")  # attributes of netCDF that tell what stands where no value is
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
-PACKING = ("scale_factor", "add_offset", *_MISSING)  # attributes that `Unpacked` minds
 _names: dict[tuple[Path, int, int], ByName[str]] = {}  # arrays in the HDF5 file opened last, and where they lie
 Content = TypeVar("Content")
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
@@ -63,24 +62,6 @@ class Reversed:
         places = key if isinstance(key, tuple) else (key,)
         full = (*places, *[slice(None)] * (self.ndim - len(places)))
         return np.asarray(self._dataset[full[::-1]]).T
-
-
-class Unpacked:
-    """Shows a data set that netCDF packed (xarray, sensors of weather and satellites) as the numbers that its attributes say it
-    stands for, f64, or of its own type where nothing is scaled; NaN where they say that a value is missing.
-    """
-
-    def __init__(self, dataset: Any, scaled: bool) -> None:
-        self._dataset, self.attrs = dataset, dataset.attrs
-        self.dtype = np.dtype(np.float64) if scaled else dataset.dtype
-        self.shape: tuple[int, ...] = dataset.shape
-        self.ndim = len(self.shape)
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        stored = np.asarray(self._dataset[key], np.float64)
-        missing = np.isin(stored, [_attribute(self, name, np.nan) for name in _MISSING])
-        values = stored * _attribute(self, "scale_factor", 1) + _attribute(self, "add_offset", 0)
-        return np.where(missing, np.nan, values).astype(self.dtype)
 
 
 class Unreadable:
@@ -125,12 +106,6 @@ def _read_attributes(*holders: Any) -> dict[str, Any]:
             with suppress(TypeError, ValueError, OSError):
                 found[name] = holder.attrs[name]
     return found
-
-
-def _attribute(dataset: Any, name: str, default: float) -> float:
-    """Returns the number that an attribute tells, the default where it tells none."""
-    told = np.ravel(dataset.attrs.get(name, default))
-    return float(told[0]) if told.dtype.kind in "uif" and told.size == 1 else default
 
 
 Array = Any  # np.ndarray, h5py.Dataset, Reversed, Unpacked or Unreadable: shape, dtype, ndim, and slices of it by []
@@ -340,9 +315,7 @@ def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.n
         return Unreadable(item, error)
     if path.suffix.lower() == ".mat":
         return Reversed(item)
-    scaled = (_attribute(item, "scale_factor", 1), _attribute(item, "add_offset", 0)) != (1, 0)
-    marked = item.dtype.kind == "f" and any(np.isfinite(_attribute(item, one, np.nan)) for one in _MISSING)
-    return Unpacked(item, scaled) if scaled or marked else item
+    return unpacked(item)
 
 
 def _require_type(item: h5py.Dataset, path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
 from dpcli.prepare.array_files.containers import open_arrays, tables_inside, told_units
+from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -58,7 +59,8 @@ def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
         cloud.unit = cloud.unit or table.unit
         return cloud
     with open_arrays(path) as arrays:
-        plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
+        shown = {name: one if name in _COLOR_KEYS else with_gaps(one) for name, one in arrays.items()}
+        plain = {name: np.asarray(one[()]) for name, one in shown.items() if not isinstance(one, list)}
         if not plain and tables_inside(path):
             ArrayTable(path)  # says that there are several
         told = {name: unit_of_comments([f"units: {told_units(arrays[name])}"]) for name in plain}
