@@ -22,6 +22,7 @@ from dpcli.prepare.cloud_formats.column_names import (
     find_colors,
     find_frame_column,
     find_trios,
+    note_of_units,
     unit_of_attributes,
 )
 from dpcli.prepare.scans.times_of_tables import seconds_of
@@ -32,12 +33,11 @@ Columns = dict[str, np.ndarray]
 class ArrayTable:
     """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
-    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "".
+    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "". cut: notes of what
+    is odd about its numbers.
 
     Raises DataError where the file holds no table, or several, or x, y and z in different units.
     """
-
-    cut: Mapping[str, int] = {}  # numbers that no text holds have all their digits
 
     def __init__(self, path: Path) -> None:
         found = _tables_of(path)
@@ -50,6 +50,7 @@ class ArrayTable:
         ((self.by_name, self.units),) = found.values()
         self.names = tuple(self.by_name)
         self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
+        self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""

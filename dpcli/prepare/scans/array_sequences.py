@@ -38,7 +38,7 @@ from dpcli.prepare.array_files.containers import (
 )
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import note_of_units, unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
@@ -247,7 +247,8 @@ class ArraySequences(OwnScans):
             }
             time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(item.path, arrays, beside, axes, source, frames)
-            unit = unit_of_comments([f"units: {told_units(arrays[source.keys[0]])}"])
+            units = told_units(arrays[source.keys[0]])
+            unit = unit_of_comments([f"units: {units}"])
             wanted = _frame_count(item.path, arrays, beside, source, len(frames))
         if item.extra["time"] and time is None:
             if not self.fps:
@@ -275,6 +276,7 @@ class ArraySequences(OwnScans):
         time = None if time is None else time[kept]
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= {MORE_FRAMES: more} if more else {}
+        sample.notes |= note_of_units(["points"], {"points": units})
         sample.notes |= {UNCOUNTED: dropped} if dropped else {}
         return sample
 
