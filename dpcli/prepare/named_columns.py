@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickletools
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -14,11 +15,14 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables, told_units
+from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.column_names import (
     axes_in,
     find_axes,
+    find_colors,
     find_frame_column,
     find_trios,
+    note_of_units,
     unit_of_attributes,
 )
 from dpcli.prepare.scans.times_of_tables import seconds_of
@@ -29,12 +33,11 @@ Columns = dict[str, np.ndarray]
 class ArrayTable:
     """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
-    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "".
+    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "". cut: notes of what
+    is odd about its numbers.
 
     Raises DataError where the file holds no table, or several, or x, y and z in different units.
     """
-
-    cut: Mapping[str, int] = {}  # numbers that no text holds have all their digits
 
     def __init__(self, path: Path) -> None:
         found = _tables_of(path)
@@ -47,6 +50,7 @@ class ArrayTable:
         ((self.by_name, self.units),) = found.values()
         self.names = tuple(self.by_name)
         self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
+        self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
@@ -164,8 +168,10 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
         for group, own in groups.items():
             frames = find_frame_column(list(own))
             rows = max(own[frames].shape) if frames else 0
-            alike = {name: one for name, one in own.items() if rows and rows in (one.shape[0], one.size)}
-            columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in alike.items()}, {})
+            alike = {name: one for name, one in own.items() if rows and rows in (one.shape[0], math.prod(one.shape))}
+            plain = {list(alike)[place] for place in find_colors(list(alike))}  # which have no gaps
+            shown = {name: one if name in plain else with_gaps(one) for name, one in alike.items()}
+            columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in shown.items()}, {})
             if columns and _are_points(columns):
                 told = {name: told_units(one) for name, one in alike.items()}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}

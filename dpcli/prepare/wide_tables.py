@@ -13,7 +13,14 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
-from dpcli.prepare.cloud_formats.column_names import ROWS_ARE_FRAMES, one_unit, unit_of, unit_of_attributes, words_of
+from dpcli.prepare.cloud_formats.column_names import (
+    ROWS_ARE_FRAMES,
+    note_of_units,
+    one_unit,
+    unit_of,
+    unit_of_attributes,
+    words_of,
+)
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, delimiter_of, names_in, seconds_by_name
 from dpcli.prepare.named_columns import ArrayTable
@@ -53,6 +60,7 @@ class WideTable:
         identities = np.tile(np.arange(len(self.trios)), len(values))
         rest = without([name for name in self.table.names if name], names)
         dropped = {MISSING: self.missing} if self.missing else {}
+        dropped |= {} if isinstance(self.table, TextTable) else note_of_units(names, self.table.units)
         points = values.reshape(-1, 3)
         return Cloud(points, unit=self.unit, columns=names, unread=rest, dropped=dropped, track=identities)
 

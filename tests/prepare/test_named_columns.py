@@ -126,12 +126,15 @@ def test_units_are_read_as_netcdf_may_write_them(tmp_path, units, meters):
         file["points"].attrs["units"] = units
     run = told("prepare", "clouds", tmp_path / "a.h5", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
     assert not run.returncode, run.stderr
+    assert ("attribute units says 'm/s', no length" in run.stderr) == (units == "m/s")
     with CloudsReader(tmp_path / "out.h5") as reader:
         assert np.allclose(reader.read(0).points.reshape(points.shape), points * meters, atol=0, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("unit", "meters"), [("mm", 1e-3), ("degrees_east", 1)])
 @pytest.mark.parametrize("form", ["points", "x y z", "table"])
-def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form):
+def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form, unit, meters):
+    """What is no length is told."""
     points = RNG.normal(size=(50, 3)) * 100
     (tmp_path / "in").mkdir()
     with h5py.File(tmp_path / "in/0.h5", "w") as file:
@@ -142,11 +145,12 @@ def test_units_of_data_sets_count_in_files_of_one_cloud(tmp_path, form):
         else:
             file["x"], file["y"], file["z"] = points.T
         for item in file.values():
-            item.attrs["units"] = "mm"
+            item.attrs["units"] = unit
     run = told("prepare", "clouds", tmp_path / "in", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
-    assert not run.returncode and "converted from mm to m" in run.stderr, run.stderr
+    assert not run.returncode, run.stderr
+    assert ("converted from mm to m" if unit == "mm" else "'degrees_east', no length") in run.stderr
     with CloudsReader(tmp_path / "out.h5") as reader:
-        assert np.allclose(reader.read(0).points, points / 1000)
+        assert np.allclose(reader.read(0).points, points * meters)
 
 
 @pytest.mark.parametrize("form", ["npy", "npz columns", "npz points", "h5 records"])
@@ -182,6 +186,16 @@ def test_units_of_columns_count(tmp_path):
     assert np.allclose(sample.points[:, 1], COLUMNS["y"] / 1000) and np.allclose(sample.time, np.arange(FRAMES) * 0.1)
 
 
+def test_columns_of_matlab_are_a_table(tmp_path):
+    """As version 7.3 has vectors: rows or columns of HDF5 in the other order."""
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        for name, values in COLUMNS.items():
+            file[name] = values[None]
+    reader = TableSequences(tmp_path / "a.mat")
+    sample = reader.read(reader.items()[0], np.random.default_rng(0)).sequence
+    assert np.allclose(sample.points[:, 1], COLUMNS["y"]) and np.allclose(sample.time, np.arange(FRAMES) * 0.1)
+
+
 def test_units_of_columns_that_differ_are_refused(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, values in COLUMNS.items():
@@ -195,18 +209,21 @@ def test_units_of_columns_that_differ_are_refused(tmp_path):
 @pytest.mark.parametrize("place", ["columns", "table"])
 @pytest.mark.parametrize("form", ["h5", "parquet", "feather"])
 @pytest.mark.parametrize("wide", [False, True])
-def test_units_beside_columns_count_in_every_form_of_table(tmp_path, form, wide, place):
-    """As attributes of HDF5 and metadata of Arrow's fields and schemas tell them: places in millimeters, times in milliseconds."""
+@pytest.mark.parametrize(("unit", "meters"), [("mm", 1e-3), ("pixels", 1)])
+def test_units_beside_columns_count_in_every_form_of_table(tmp_path, form, wide, place, unit, meters):
+    """As attributes of HDF5 and metadata of Arrow's fields and schemas tell them: places in millimeters, times in milliseconds.
+    What is no length is told.
+    """
     coordinates = [f"{part}_{axis}" for part in "ab" for axis in "xyz"] if wide else list("xyz")
     columns = {"frame": np.arange(4), "time": np.arange(4) * 40} | {name: np.arange(4) + 0.5 for name in coordinates}
-    units = {"time": "ms", **dict.fromkeys(coordinates[:-1], "mm")}
+    units = {"time": "ms", **dict.fromkeys(coordinates[:-1], unit)}
     units = units if place == "columns" else {"time": "ms"}
     path = tmp_path / f"a.{form}"
     if form == "h5":
         with h5py.File(path, "w") as file:
             if place == "table":
                 file["log"] = np.rec.fromarrays(list(columns.values()), names=list(columns))
-                file["log"].attrs["units"] = "mm"
+                file["log"].attrs["units"] = unit
             else:
                 for name, one in columns.items():
                     file[name] = one
@@ -219,16 +236,17 @@ def test_units_beside_columns_count_in_every_form_of_table(tmp_path, form, wide,
             )
             for name, one in columns.items()
         ]
-        schema = arrow.schema(fields, metadata={"unit": "mm"} if place == "table" else {})
+        schema = arrow.schema(fields, metadata={"unit": unit} if place == "table" else {})
         table = arrow.table([arrow.array(one) for one in columns.values()], schema=schema)
         write = import_module(f"pyarrow.{form}")
         (write.write_table if form == "parquet" else write.write_feather)(table, path)
     track = ("--track", "columns") if wide else ()
     words = ("prepare", "clouds", path, "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
-    assert not told(*words, *track).returncode
+    run = told(*words, *track)
+    assert not run.returncode and ("'pixels', no length that is known" in run.stderr) == (unit == "pixels")
     with CloudsReader(tmp_path / "out.h5") as reader:
         sample = reader.read(0)
-    assert np.allclose(sample.points[:: 2 if wide else 1, 2], (np.arange(4) + 0.5) / 1000)
+    assert np.allclose(sample.points[:: 2 if wide else 1, 2], (np.arange(4) + 0.5) * meters)
     if (form, place) != ("h5", "table"):
         assert np.allclose(sample.time, np.arange(4) * 0.04)
 

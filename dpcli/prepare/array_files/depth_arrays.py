@@ -12,7 +12,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.axes import MATRICES, are_poses
-from dpcli.prepare.array_files.containers import PACKING, Unreadable, attributes_of, open_arrays, told_units
+from dpcli.prepare.array_files.containers import Unreadable, attributes_of, open_arrays, told_units
+from dpcli.prepare.array_files.netcdf_packing import PACKING, Unpacked
 
 # names that say depth, and not a picture of it or what lies beside it
 DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
@@ -87,7 +88,7 @@ def archived_depth(path: Path) -> ArchivedDepth:
         chosen = next((choice[0] for choice in (called, plainly, shaped) if len(choice) == 1), None)
         if chosen is None:
             raise DataError(f"{path}: arrays {first_names(list(arrays), 8) or 'none'}; expected one called depth")
-        depth = np.asarray(arrays[chosen][()])
+        depth = _marked(arrays[chosen])
         depth = _of_matlab(path, depth) if path.suffix.lower() == ".mat" else depth
         others = {k: one for k, one in arrays.items() if k != chosen and not isinstance(one, Unreadable)}
         small = {name: np.asarray(one[()]) for name, one in others.items() if np.prod(one.shape) <= _SMALL}
@@ -99,6 +100,17 @@ def archived_depth(path: Path) -> ArchivedDepth:
             tuple(name for name in others if name not in small),
             _told_by_attributes(arrays[chosen]),
         )
+
+
+def _marked(array: Any) -> np.ndarray:
+    """Returns depth as it is stored, with the greatest of its whole numbers in place of those that netCDF declares missing: what
+    `depth_units.without_marks` drops and counts.
+    """
+    values = np.asarray(array[()])
+    if not isinstance(array, Unpacked) or values.dtype.kind not in "ui":
+        return values
+    mark = np.iinfo(values.dtype).max if values.dtype.itemsize > 1 else 0  # 8 bits have no marks
+    return np.where(array.missing() & (values != 0), values.dtype.type(mark), values)
 
 
 def _told_by_attributes(array: Any) -> dict[str, np.ndarray]:

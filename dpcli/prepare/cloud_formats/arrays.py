@@ -10,6 +10,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
 from dpcli.prepare.array_files.containers import open_arrays, tables_inside, told_units
+from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -19,7 +20,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     unnamed_columns,
     without,
 )
-from dpcli.prepare.cloud_formats.column_names import find_frame_column, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import find_frame_column, note_of_units, unit_of_comments
 from dpcli.prepare.named_columns import ArrayTable, holds_table
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
@@ -56,15 +57,18 @@ def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
         _refuse_frames(path, table.by_name)
         cloud = cloud_of_columns(path, table.by_name, keep)
         cloud.unit = cloud.unit or table.unit
+        cloud.dropped |= table.cut
         return cloud
     with open_arrays(path) as arrays:
-        plain = {name: np.asarray(one[()]) for name, one in arrays.items() if not isinstance(one, list)}
+        shown = {name: one if name in _COLOR_KEYS else with_gaps(one) for name, one in arrays.items()}
+        plain = {name: np.asarray(one[()]) for name, one in shown.items() if not isinstance(one, list)}
         if not plain and tables_inside(path):
             ArrayTable(path)  # says that there are several
-        told = {name: unit_of_comments([f"units: {told_units(arrays[name])}"]) for name in plain}
+        told = {name: told_units(arrays[name]) for name in plain}
     cloud = _cloud_of_arrays(path, {name: _as_vector(name, one) for name, one in plain.items()}, keep)
-    units = {told[name] for name in cloud.columns[:3]} - {""}
+    units = {unit_of_comments([f"units: {told[name]}"]) for name in cloud.columns[:3]} - {""}
     cloud.unit = cloud.unit or (units.pop() if len(units) == 1 else "")
+    cloud.dropped |= note_of_units(cloud.columns[:3], told)
     return cloud
 
 

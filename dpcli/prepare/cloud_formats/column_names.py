@@ -48,6 +48,12 @@ _IN_WORDS = re.compile(  # "x, y, z in mm", but no "resolution in mm"
     r"|and)\b[^a-z]*)+\bin\s+[\[(]?(?P<unit>[a-z]+)\b(?!\s*/)",
     re.IGNORECASE,
 )
+_UNTOLD = frozenset(
+    "1 - none no unit units unitless dimensionless unknown na n/a raw normalized arbitrary a.u. au".split()
+)
+NO_LENGTH = (
+    "sequences or frames whose attribute units says {}, no length that is known: taken for the output's unit (--scale)"
+)
 _METERS = {1e-6: "um", 1e-3: "mm", 1e-2: "cm", 1e-1: "dm", 1.0: "m", 1e3: "km"}  # as netCDF writes them: 1e-3 m
 _MICRO = re.compile("[\u00b5\u03bc]")  # two letters look like a micro sign
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
@@ -167,6 +173,23 @@ def unit_of_attributes(path: Path, names: Iterable[str], told: Mapping[str, str]
             except DataError as error:
                 raise DataError(f"{path}: {error}") from None
     return ""
+
+
+def note_of_units(names: Iterable[str], told: Mapping[str, str]) -> dict[str, int]:
+    """Returns a note where attributes of columns with coordinates, or else of their whole table, tell a unit that is no known
+    length; {} where they tell one or none, or the names do. names and told: as `unit_of_attributes` has them.
+
+    >>> list(note_of_units("xy", {"x": "degrees_east", "y": "m"})) == [NO_LENGTH.format("'degrees_east'")]
+    True
+    >>> note_of_units("x", {"x": "mm", "": "pixels"}), note_of_units(["x_mm"], {"x_mm": "pixels"}), note_of_units("x", {"": "1"})
+    ({}, {}, {})
+    """
+    names = [name for name in names if not unit_of(name)]
+    own = [told[name] for name in names if name in told] or ([told[""]] if names and "" in told else [])
+    strange = [
+        unit for unit in own if unit.strip().lower() not in {"", *_UNTOLD} and not unit_of_comments([f"units: {unit}"])
+    ]
+    return {NO_LENGTH.format(", ".join(repr(unit[:40]) for unit in dict.fromkeys(strange))): 1} if strange else {}
 
 
 def one_unit(units: set[str]) -> str:

@@ -14,6 +14,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import (
     axes_in,
     find_axes,
+    note_of_units,
     seconds_in_brackets,
     unit_of_attributes,
     words_of,
@@ -74,6 +75,7 @@ class ParquetTable:
         told = {field.name: _told_units(field.metadata) for field in schema} | {"": _told_units(schema.metadata)}
         self.units = {name: units for name, units in told.items() if units}
         self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
+        self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
@@ -98,11 +100,6 @@ class ParquetTable:
         return [
             "" if value is None or value != value else str(value) for value in self._table.column(place).to_pylist()
         ]
-
-    @property
-    def cut(self) -> dict[str, int]:
-        """Returns {}: numbers that no text holds have all their digits."""
-        return {}
 
     def moments(self, place: int) -> np.ndarray | None:
         """Returns the seconds f64 (N) since the first of a column of times or durations, or of numbers in what the metadata call a

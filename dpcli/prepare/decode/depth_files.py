@@ -413,15 +413,14 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
 
     attributes = dict(found.attributes)
     unit = unit_of_comments([f"units: {attributes.pop('units', '')}"])
-    if unit and found.depth.dtype.kind != "f":
-        attributes["depth_unit"] = np.array(unit)
+    own = {"depth_unit": np.array(unit)} if unit and found.depth.dtype.kind != "f" else {}
     clocks = [name for name, one in found.small.items() if says_times(name.rpartition("/")[2]) and one.size == frames]
     times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
     name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
     try:
-        camera, scale, rest = camera_of_arrays(path, {**attributes, **found.small})
+        camera, scale, rest = camera_of_arrays(path, {**attributes, **own, **found.small})
     except DataError:
-        camera, scale, rest = camera_of_arrays(path, found.small)
+        camera, scale, rest = camera_of_arrays(path, {**own, **found.small})
         rest += tuple(f"attribute {one}" for one in attributes)
     unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
     notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}

@@ -36,8 +36,9 @@ from dpcli.prepare.array_files.containers import (
     tables_inside,
     told_units,
 )
+from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import note_of_units, unit_of_comments
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
@@ -246,7 +247,8 @@ class ArraySequences(OwnScans):
             }
             time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(item.path, arrays, beside, axes, source, frames)
-            unit = unit_of_comments([f"units: {told_units(arrays[source.keys[0]])}"])
+            units = told_units(arrays[source.keys[0]])
+            unit = unit_of_comments([f"units: {units}"])
             wanted = _frame_count(item.path, arrays, beside, source, len(frames))
         if item.extra["time"] and time is None:
             if not self.fps:
@@ -274,6 +276,7 @@ class ArraySequences(OwnScans):
         time = None if time is None else time[kept]
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= {MORE_FRAMES: more} if more else {}
+        sample.notes |= note_of_units(["points"], {"points": units})
         sample.notes |= {UNCOUNTED: dropped} if dropped else {}
         return sample
 
@@ -291,7 +294,8 @@ class ArraySequences(OwnScans):
             raise DataError(
                 f"{path}: {option} {name}: no array of one number for each point, {flat or 'as frames have'}"
             )
-        return _cut(arrays[name], axes.replace("C", ""), source.place)
+        array = arrays[name] if name == self.track else with_gaps(arrays[name])
+        return _cut(array, axes.replace("C", ""), source.place)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
@@ -389,9 +393,9 @@ def _cut(array: Any, axes: str, place: int | None) -> np.ndarray:
 def _frames(path: Path, arrays: Mapping[str, Any], source: Source, axes: str) -> list[np.ndarray]:
     """Returns the points of each frame, (N,3) of the file's precision."""
     if axes:
-        return list(_as_points(_cut(arrays[source.keys[0]], axes, source.place)))
+        return list(_as_points(_cut(with_gaps(arrays[source.keys[0]]), axes, source.place)))
     if len(source.keys) > 1:
-        found = [np.asarray(arrays[key][()]) for key in source.keys]
+        found = [np.asarray(with_gaps(arrays[key])[()]) for key in source.keys]
         return [_as_points(one) if one.size else np.zeros((0, 3), np.float32) for one in found]
     parts = arrays[source.keys[0]]
     if source.place is not None:

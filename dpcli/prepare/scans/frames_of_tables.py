@@ -238,8 +238,9 @@ def _in_frames(name: str, frames: np.ndarray, numbers: np.ndarray | None, rows: 
 
 def _are_rounded(numbers: np.ndarray) -> bool:
     """Returns whether large numbers (T) are all such as float32 has, whose neighbors there are 128 or more apart."""
-    with np.errstate(over="ignore"):
-        return bool(len(numbers) and abs(numbers[-1]) >= _SPARSE and (numbers.astype(np.float32) == numbers).all())
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = numbers.astype(np.float32).astype(numbers.dtype)  # whole numbers stay exact where they are compared
+        return bool(len(numbers) and abs(numbers[-1]) >= _SPARSE and (single == numbers).all())
 
 
 def _fills_counter(numbers: np.ndarray) -> int:

@@ -83,8 +83,12 @@ def test_a_camera_and_a_unit_in_single_numbers_of_hdf5_are_used(tmp_path, place)
 
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1000), ("cm", 100), ("raw", 1000)])
 def test_the_unit_of_depth_in_whole_numbers_counts(tmp_path, unit, scale):
+    """Beside attributes that tell no camera, too, which are named."""
     found, _ = read(write(tmp_path / "a.h5", {"depth": DEPTH}, units=unit))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+    found, notes = read(write(tmp_path / "b.h5", {"depth": DEPTH}, units=unit, fx=500.0))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+    assert "not read (attribute fx)" in notes
 
 
 def test_doubles_of_matlab_that_mark_what_is_unseen_are_millimeters_too(tmp_path):

@@ -180,12 +180,14 @@ def test_names_of_frames_in_the_order_of_the_alphabet_are_put_in_that_of_their_n
     assert "1 row without a number in 'frame', the first is 2" in item.problem
 
 
-@pytest.mark.parametrize("first", [2**53, 1_709_640_000_123_456_789, 2**64 - 9])
+@pytest.mark.parametrize("first", [2**53, 2**60, 1_709_640_000_123_456_789, 2**64 - 9])
 def test_numbers_that_no_float_holds_stay_apart(tmp_path, first):
     rows = [(first + k, k, 1, 2) for k in range(4)]
     sequence, _ = only_sequence(csv(tmp_path / "a.csv", "frame,x,y,z", rows), fps=10)
     assert sequence.num_frames == 4
     np.testing.assert_allclose(sequence.time, [0, 0.1, 0.2, 0.3])
+    reader = TableSequences(tmp_path / "a.csv")
+    assert ROUNDED not in reader.read(reader.items()[0], RNG).notes
 
 
 def test_times_that_float32_rounded_are_told(tmp_path):
