@@ -77,7 +77,7 @@ def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
     corner = np.vstack([np.zeros((1, 3)), POINTS])
     assert clean([Cloud(corner), Cloud(corner)]) == {}
     assert clean([Cloud(corner), Cloud(np.vstack([corner, np.zeros((1, 3))]))]) == {AT_ORIGIN: 3}
-    for place in (448_000, -448_000):
+    for place in ([448_000, 5_411_000, 300], [-448_000, -5_411_000, 0]):
         assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + place]))]) == {AT_ORIGIN: 1}
 
 
