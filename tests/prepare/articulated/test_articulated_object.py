@@ -240,12 +240,13 @@ def test_what_doesnt_move_isnt_a_part():
     b.hinge((0, 0, 0.1), Z, -180, 180, cylinder(0.4, 0.3, (0, 0, 0.15)))  # spins in itself
     b.slide((0, 0, -0.3), Z, 0, 0.001, box((0.5, 0.5, 0.1)))
     b.slide((0, 0, -0.5), Z, -0.4, 0, box((0.5, 0.5, 0.1)))
+    b.hinge((0.4, 0, 0.1), Z, -180, 180, cylinder(0.012, 0.8, (0, 0, 0.4)))  # a pin, whose surface goes nowhere
     obj = b.build("spinner")
-    assert study(obj, Articulation()).locked == {1}
-    assert study(obj, Articulation(visible_only=True)).locked == {0, 1}
-    with pytest.raises(DataError, match="spinner: one rigid part only; none of its joints .3. moves its part visibly"):
+    assert study(obj, Articulation()).locked == {1, 3}
+    assert study(obj, Articulation(visible_only=True)).locked == {0, 1, 3}
+    with pytest.raises(DataError, match="spinner: one rigid part only; none of its joints .4. moves its part visibly"):
         study(obj, Articulation(visible_only=True, min_motion=0.5))
-    assert len(study(obj, Articulation(min_motion=0.9)).locked) == 2  # without it, what moves most stays
+    assert len(study(obj, Articulation(min_motion=0.9)).locked) == 3  # without it, what moves most stays
 
 
 def test_glued_parts_hold_still_and_share_an_id():
