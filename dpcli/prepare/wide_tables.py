@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.array_files.containers import SUFFIXES
-from dpcli.prepare.cloud_formats.cloud import Cloud, without
+from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
     note_of_units,
@@ -58,11 +58,10 @@ class WideTable:
         values = self.table.columns(self.trios.ravel().tolist())
         names = tuple(self.table.names[place] for place in self.trios.ravel())
         identities = np.tile(np.arange(len(self.trios)), len(values))
-        rest = without([name for name in self.table.names if name], names)
         dropped = {MISSING: self.missing} if self.missing else {}
         dropped |= {} if isinstance(self.table, TextTable) else note_of_units(names, self.table.units)
         points = values.reshape(-1, 3)
-        return Cloud(points, unit=self.unit, columns=names, unread=rest, dropped=dropped, track=identities)
+        return Cloud(points, unit=self.unit, columns=names, dropped=dropped, track=identities)
 
     def rows(self) -> list[Rows]:
         """Returns the one sequence of a table without a column of frames: its rows as they come."""

@@ -72,6 +72,7 @@ def test_bad_rows_are_refused(tmp_path):
             "2 of 4 samples .*, the first 'v1'; predict",
         ),
         ("label", np.array([0, 1, 2, 0], np.int32), "label 2 of 'v2'"),
+        ("label", np.array([0, -1, -2, 0], np.int32), "label -2 of 'v2'"),
         ("name", ["v0", "v0", "v2", "v3"], "names repeat"),
         ("class_names", ["a", "a"], "1 class names repeat, such as 'a'"),
         ("class_names", np.arange(2), "'class_names' holds something else .*expected str"),

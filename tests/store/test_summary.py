@@ -52,6 +52,14 @@ def test_summary_of_clouds_by_hand(tmp_path: Path) -> None:
         assert found["range"][axis] == [points[:, column].min(), points[:, column].max()]
 
 
+def test_the_parts_of_each_sequence_are_counted(tmp_path: Path) -> None:
+    with CloudsWriter(tmp_path / "c.h5", class_names=["x"], fields=["part"]) as writer:
+        for name, ids in (("a", [[0, 2, -1], [2, 2]]), ("b", [[1, 1]]), ("c", [[0, 1], [5, 3, -1]])):
+            frames = [np.ones((len(own), 3)) for own in ids]
+            writer.write(CloudSequence.from_frames(name, frames, part=[np.array(own, np.int16) for own in ids]))
+    assert summary(tmp_path / "c.h5")["parts_per_sequence"] == {"min": 1, "median": 2, "max": 4}
+
+
 def test_activations_are_among_the_fields(tmp_path: Path) -> None:
     write_clouds(tmp_path / "c.h5")
     with h5py.File(tmp_path / "c.h5", "r+") as file:

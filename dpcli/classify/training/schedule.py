@@ -30,7 +30,7 @@ class Schedule:
         "Course of the learning rate: cosine (to 0, after a short warm-up), staircase (times 0.7 every 200,000 clips, as the"
         " published code does), or constant.",
     )
-    weight_decay: float = setting(0.0, "Weight decay of AdamW, for matrices only.", least=0)
+    weight_decay: float = setting(0.0, "Weight decay of AdamW, for matrices and the last layer's biases.", least=0)
     label_smoothing: float = setting(
         0.0, "Share of each label spread over all classes: streams become less confident.", least=0, below=1
     )

@@ -128,9 +128,8 @@ def carve_hull(
     masked = [np.dstack([picture[..., 3], _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
     kept: list[np.ndarray] = []
     reach = max(_ray_reach(picture[..., 3] > 0.5, *camera) for picture, *camera in zip(pictures, intrinsics, poses))
-    radius = (
-        _SPHERE if reach <= _WITHIN else np.sqrt(2) * reach
-    )  # two views at a right angle may both look along a diagonal
+    # two views at a right angle may both look along a diagonal
+    radius = _SPHERE if reach <= _WITHIN else np.sqrt(2) * reach
     for _ in range(_ROUNDS):
         points = sample_sphere(_CANDIDATES, radius, rng)
         seen = np.stack(

@@ -152,15 +152,15 @@ def _of_digits(words: Sequence[str], values: np.ndarray) -> np.ndarray | None:
 
 
 def unit_by_rate(column: str, values: np.ndarray, fps: float) -> float:
-    """Returns how many seconds one unit of a column of times in whole numbers is, if one makes its steps those of ``fps``; else
-    0.
+    """Returns how many seconds one unit of a column of rising times in whole numbers is, if one makes its steps those of
+    ``fps``; else 0.
 
     >>> unit_by_rate("time", np.array([0, 33, 67, 100]), 30), unit_by_rate("t", np.array([0, 1, 2, 5]), 30)
     (0.001, 0.0)
     """
     if not set(words_of(column)) & _TIME_WORDS or len(values) < 2:
         return 0.0
-    step = float(np.median(np.diff(np.unique(values)))) * fps
+    step = float(np.median(np.diff(values))) * fps
     return next((unit for unit in (1e-3, 1e-6, 1e-9) if 0.5 < step * unit < 2), 0.0)
 
 

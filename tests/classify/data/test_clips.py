@@ -160,7 +160,8 @@ def test_normalizations():
     unit = normalize(points, "unit")
     assert np.isclose(np.linalg.norm(unit, axis=-1).max(), 1)
     image = normalize(points, "image")
-    assert np.allclose(image[..., 0], (points[..., 0] - points[..., 0].mean()) / 120, atol=1e-5)
+    for axis, size in ((0, 120), (1, 160)):
+        assert np.allclose(image[..., axis], (points[..., axis] - points[..., axis].mean()) / size, atol=1e-5)
     assert np.isclose(image[..., 2].std(), 1, atol=1e-4) and normalize(points, "none") is points
     flat = points.copy()
     flat[..., 2] = 5
@@ -216,6 +217,41 @@ def test_augmentation_is_one_rigid_draw_a_clip():
     thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9, 0)(points, np.random.default_rng(3))
     assert len(np.unique(thinned[0], axis=0)) < 40 and np.isin(thinned[..., 0].round(4), points[..., 0].round(4)).all()
     assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0, 0)
+
+
+def linear_maps(points: np.ndarray, change: Augmentation, draws: int) -> np.ndarray:
+    """The matrices A (draws,3,3) with which x - mean becomes A (x - mean) in as many draws, found by least squares."""
+    around = (points - points.mean((0, 1))).reshape(-1, 3)
+    made = [change(points, np.random.default_rng(seed)).reshape(-1, 3) for seed in range(draws)]
+    return np.array([np.linalg.lstsq(around, one - one.mean(0), rcond=None)[0].T for one in made])
+
+
+def test_each_change_of_an_augmentation_is_the_one_that_it_names():
+    points = np.random.default_rng(0).normal(2, 1, (2, 4, 3)).astype(np.float32)
+    turns = linear_maps(points, replace(NONE, turn=0.5), 100)
+    assert np.allclose(turns[:, 1], [0, 1, 0], atol=1e-5) and np.allclose(turns[:, :, 1], [0, 1, 0], atol=1e-5)
+    angles = np.arctan2(turns[:, 0, 2], turns[:, 0, 0])
+    assert -0.5 <= angles.min() < -0.47 and 0.47 < angles.max() <= 0.5 and np.allclose(np.linalg.det(turns), 1)
+    tilts = linear_maps(points, replace(NONE, tilt=0.1), 600)  # Rz Ry Rx, whose angles its entries tell
+    about_x, about_z = np.arctan2(tilts[:, [2, 1], [1, 0]], tilts[:, [2, 0], [2, 0]]).T
+    angles = np.stack([about_x, -np.arcsin(tilts[:, 2, 0]), about_z], axis=1)
+    assert np.allclose(angles.std(0), 0.1, rtol=0.15) and 0.28 < np.abs(angles).max() < 0.3001
+    sizes = linear_maps(points, replace(NONE, scale=0.2), 100)
+    assert np.allclose(sizes, sizes[:, :1, :1] * np.eye(3), atol=1e-5) and 1.18 < sizes.max() < 1.2001
+    assert 0.7999 < sizes[:, 0, 0].min() < 0.82
+    both = linear_maps(points, replace(NONE, scale=0.2, per_axis=True, turn=0.5), 20)  # the body's axes, then turned
+    squares = both.transpose(0, 2, 1) @ both
+    assert np.allclose(squares, squares * np.eye(3), atol=1e-5) and np.ptp(squares[0].diagonal()) > 0.01
+    shifts = np.array([replace(NONE, shift=0.1)(points, np.random.default_rng(s)) - points for s in range(100)])
+    assert np.allclose(shifts, shifts[:, :1, :1], atol=1e-6) and (abs(np.abs(shifts).max((0, 1, 2)) - 0.1) < 0.01).all()
+    jitter = replace(NONE, jitter=0.05)(np.zeros((2, 5000, 3), np.float32), np.random.default_rng(0))
+    assert np.allclose(jitter.std(1), 0.05, rtol=0.05) and 0.14 < np.abs(jitter).max() < 0.1501
+    many = np.arange(6000, dtype=np.float32).reshape(2, 1000, 3)
+    thin = np.array([replace(NONE, dropout=0.6)(many, np.random.default_rng(s)) for s in range(50)])
+    own = (thin == many).all(-1)
+    assert own[:, :, 0].all() and (own[..., 1:] | (thin[:, :, 1:] == thin[:, :, :-1]).all(-1)).all()
+    lost = 1 - own.mean(2)
+    assert lost.min() < 0.05 and 0.5 < lost.max() < 0.65 and np.abs(np.diff(lost)).max() < 0.1  # one share a clip
 
 
 def test_a_warp_bends_space_alike_at_all_times_and_keeps_neighbors_near():

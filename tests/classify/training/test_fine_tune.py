@@ -127,12 +127,19 @@ def test_only_what_learns_changes_and_batch_norms_of_the_rest_stay(part, stage, 
     freeze(branch, part)
     train_mode(branch, part)
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    step = StageStep(network, stage, Schedule(batch=4, fine_tune=part), torch.device("cpu"), Processes())
+    schedule = Schedule(batch=4, fine_tune=part, weight_decay=0.5)
+    step = StageStep(network, stage, schedule, torch.device("cpu"), Processes())
     step(torch.randn(4, 2, 32, 3) * 0.2, torch.tensor([0, 1, 2, 0]), 0.01)
     changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
     stream = "static" if stage == 0 else "dynamic"
     slowest = min(group["share"] for group in step.optimizer.param_groups)
     assert slowest == (0.1 if part == "all" else 1.0)  # a head alone has few steps, and its last layer is new
+    groups = {id(one): group for group in step.optimizer.param_groups for one in group["params"]}
+    for name, one in branch.named_parameters():
+        last, group = name.startswith("head.classify"), groups.pop(id(one), None)
+        told = (slowest if last else 1.0, 0.5 if last or one.dim() > 1 else 0.0, 0.01 * (slowest if last else 1.0))
+        assert (group and (group["share"], group["weight_decay"], group["lr"])) == (told if one.requires_grad else None)
+    assert not groups
     start = {"probe": f"{stream}.head.classify", "head": f"{stream}.head", "all": stream}[part]
     assert changed and all(name.startswith(start) for name in changed)
     assert f"{stream}.head.classify.weight" in changed

@@ -299,6 +299,7 @@ def test_labels_from_folders(tmp_path):
         (["train/a", "test/b"], "CLASS/VIDEO", [(1, ""), (0, "")]),  # two classes of these names
         (["train/a", "test/b"], "CLASS", [(0, "train"), (1, "test")]),
         (["train/a/1", "b/a/2"], "CLASS/VIDEO", [(1, ""), (0, "")]),
+        (["train/a/1", "train/b/2", "b/3"], "CLASS/VIDEO", [(1, ""), (1, ""), (0, "")]),
         (["a", "b/x"], "CLASS", [(0, ""), (1, "")]),
     ],
 )

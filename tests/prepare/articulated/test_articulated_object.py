@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_object import joint_motion, lock_some, parts, sample_values, transform
@@ -40,6 +41,7 @@ from dpcli.prepare.pipeline import convert_item
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
+from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
 from tests.support.articulated_helpers import cabinet, distance_to_triangles, link, write_urdf
 from tests.support.articulated_helpers import joint as joint_xml
 from tests.support.commands import told as dpc
@@ -163,6 +165,16 @@ def test_relative_motions_are_those_of_the_joints(tmp_path):
         assert values.min() >= joint.lower - 1e-9 and values.max() <= joint.upper + 1e-9
         assert np.abs(np.diff(values)).max() <= 0.3 * (joint.upper - joint.lower) + 1e-9  # --joint-step
         assert np.ptp(values) >= 0.15 * (joint.upper - joint.lower) - 1e-9
+        told, turns = sequence.joint[:, k + 1], joint.kind == "revolute"
+        assert (told[:, PARENT] == 0).all() and (told[:, TYPE] == (REVOLUTE if turns else PRISMATIC)).all()
+        np.testing.assert_allclose(told[:, VALUE], values * (1 if turns else scale), atol=1e-9)
+        carried = sequence.pose[:, 0] @ np.linalg.inv(sequence.pose[0, 0]) @ sequence.pose[0, k + 1]
+        for row, before, after in zip(told, carried, sequence.pose[:, k + 1], strict=True):
+            step = (row[VALUE] - told[0, VALUE]) * row[AXIS]  # along or about the axis, since the first frame
+            turn = Rotation.from_rotvec(step if turns else 0 * step).as_matrix()
+            place = turn @ (before[:3, 3] - row[POINT]) + row[POINT] + (0 if turns else step)
+            np.testing.assert_allclose(after[:3, 3], place, atol=1e-9)
+            np.testing.assert_allclose(after[:3, :3], turn @ before[:3, :3], atol=1e-9)
 
 
 def test_frame_0_fits_its_sphere_and_is_centered():
@@ -228,12 +240,13 @@ def test_what_doesnt_move_isnt_a_part():
     b.hinge((0, 0, 0.1), Z, -180, 180, cylinder(0.4, 0.3, (0, 0, 0.15)))  # spins in itself
     b.slide((0, 0, -0.3), Z, 0, 0.001, box((0.5, 0.5, 0.1)))
     b.slide((0, 0, -0.5), Z, -0.4, 0, box((0.5, 0.5, 0.1)))
+    b.hinge((0.4, 0, 0.1), Z, -180, 180, cylinder(0.012, 0.8, (0, 0, 0.4)))  # a pin, whose surface goes nowhere
     obj = b.build("spinner")
-    assert study(obj, Articulation()).locked == {1}
-    assert study(obj, Articulation(visible_only=True)).locked == {0, 1}
-    with pytest.raises(DataError, match="spinner: one rigid part only; none of its joints .3. moves its part visibly"):
+    assert study(obj, Articulation()).locked == {1, 3}
+    assert study(obj, Articulation(visible_only=True)).locked == {0, 1, 3}
+    with pytest.raises(DataError, match="spinner: one rigid part only; none of its joints .4. moves its part visibly"):
         study(obj, Articulation(visible_only=True, min_motion=0.5))
-    assert len(study(obj, Articulation(min_motion=0.9)).locked) == 2  # without it, what moves most stays
+    assert len(study(obj, Articulation(min_motion=0.9)).locked) == 3  # without it, what moves most stays
 
 
 def test_glued_parts_hold_still_and_share_an_id():

@@ -277,6 +277,11 @@ def test_single_view_shows_no_hidden_surface(meshes):
     low, high = placed.reshape(-1, 3).min(0), placed.reshape(-1, 3).max(0)
     eye = (low + high) / 2 + [0, 0, 0.7 * (high - low).max() / np.tan(np.pi / 6)]
     seen = points_on(placed, seen_by_camera(placed))
+    x, y, z = ((seen - eye) * [1, -1, -1]).T
+    focal = 180 / np.tan(np.pi / 6)  # a picture of 640x360, 60 degrees high, whose pixels' centers see
+    pixels = np.stack([focal * x / z + 320, focal * y / z + 180])
+    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-3)
+    assert len(np.unique(np.floor(pixels), axis=1).T) == len(seen)
     few = seen[generator(0).permutation(len(seen))[:200]]
     assert not hidden(eye, few, placed).any()
     whole = points_on(placed, choose_on_surface(triangle_areas(placed), 200, generator(0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import Material, Texture, normalized
 from dpcli.prepare.meshes.animation import animation_clip, list_clips, load_animation
 from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, motion_distance, rigid_parts, track_points
-from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film
+from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film, ground_truth
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 from dpcli.prepare.meshes.gltf_nodes import clip_names
@@ -300,6 +301,17 @@ def test_points_of_a_part_move_as_one_body(tmp_path):
         assert np.ptp(apart, axis=0).max() < 1e-5
     everyone = np.linalg.norm(track[:, :, None] - track[:, None], axis=-1)
     assert np.ptp(everyone, axis=0).max() > 0.1  # the two together don't
+
+
+def test_the_tolerance_of_parts_is_a_share_of_the_radius(tmp_path):
+    mesh = normalized(load_animation(arm().write(tmp_path / "arm.glb"), None, 6), OBJECT_RADIUS)
+    points = choose_points(mesh, SMALL.tracks, generator(SMALL.seed))
+    track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
+    upper, lower = np.unique(bone)
+    first, second = ((mesh.bone_pose @ np.linalg.inv(mesh.bone_pose[0]))[:, one] for one in (upper, lower))
+    apart = motion_distance(first, second, track[0, bone == lower].astype(np.float64)) / 0.75  # the radius
+    for share, parts in ((0.99, 2), (1.01, 1)):
+        assert len(np.unique(ground_truth(mesh, replace(SMALL, part_tolerance=share * apart))[1])) == parts
 
 
 def points_along(points: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.cloud_formats.cloud import BEYOND
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
 from dpcli.prepare.recordings.depth import CHANGES
-from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
+from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message, depth_of_message
 from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
 from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, PACES, SEVERAL_PLACES, SORTED, UNLISTED
 from dpcli.prepare.scans.assembling import UNREAD_COLORS
@@ -442,6 +442,13 @@ def test_images_that_are_no_depth_are_named(tmp_path, frame, encoding, message):
     path = write_recording(tmp_path / "run", "bag", make, [("/i", START, make.image(frame, encoding=encoding))])
     with pytest.raises(DataError, match=message):
         read(DepthVideos(inputs=(path,), fov=60))
+
+
+@pytest.mark.parametrize("change", [{"step": 16}, {"width": 17}, {"height": 13}])
+def test_an_image_whose_bytes_are_not_of_its_size_is_damaged(change):
+    sent = Messages("mcap").image(depth16())
+    with pytest.raises(DataError, match="an image of .* 16UC1 has 384 bytes; it is damaged"):
+        depth_of_message(Path("a.mcap"), "sensor_msgs/msg/Image", replace(sent, **change))
 
 
 IR, PLAIN, JPEG = "/kinect/ir/image_raw", "/usb_cam/image_raw", "mono8; jpeg compressed "

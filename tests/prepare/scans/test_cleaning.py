@@ -77,7 +77,8 @@ def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
     corner = np.vstack([np.zeros((1, 3)), POINTS])
     assert clean([Cloud(corner), Cloud(corner)]) == {}
     assert clean([Cloud(corner), Cloud(np.vstack([corner, np.zeros((1, 3))]))]) == {AT_ORIGIN: 3}
-    assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + 448_000]))]) == {AT_ORIGIN: 1}
+    for place in ([448_000, 5_411_000, 300], [-448_000, -5_411_000, 0]):
+        assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + place]))]) == {AT_ORIGIN: 1}
 
 
 @pytest.mark.parametrize("jump", [True, False])
@@ -97,6 +98,8 @@ def test_a_followed_point_that_jumps_to_the_origin_was_not_seen(jump):
     ]
     clouds = [Cloud(frame.copy()) for frame in frames]  # without identities nothing tells
     assert not clean(clouds)
+    frames[1][0] += 1  # where another point goes as far, one that comes from the origin may, too
+    assert not clean([Cloud(frame.copy(), track=np.arange(len(frame))) for frame in frames])
 
 
 def test_frames_of_one_row_that_stands_for_nothing():

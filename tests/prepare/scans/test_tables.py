@@ -61,6 +61,8 @@ def test_sequences_by_a_column(tmp_path):
     assert [(s.sequence.name, s.sequence.num_frames) for s in found] == [("log/b", 3), ("log/a", 2)]
     found = sequences(path, sequence_column="run", gap=2)
     assert [s.sequence.name for s in found] == ["log/b/000", "log/b/001", "log/a/000"]
+    path = write(tmp_path / "log.csv", [("day 1/b", *row) for row in frames(0, 1)], "run,frame,x,y,z")
+    assert [s.sequence.name for s in sequences(path, sequence_column="run")] == ["log/day 1_b"]
 
 
 @pytest.mark.parametrize(

@@ -287,9 +287,9 @@ def test_colors_that_only_some_objects_of_a_file_have_are_left_out_and_counted(t
 
 
 @pytest.mark.parametrize("mixed_up", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("count", [60, 1500])
+@pytest.mark.parametrize(("count", "unit"), [(60, 0.01), (1500, 1.0)])
 def test_rows_that_are_not_the_same_points_are_doubted(
-    mixed_up: float, count: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    mixed_up: float, count: int, unit: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(count)
     shape = rng.normal(size=(count, 3)) * [3, 1, 0.3]
@@ -297,7 +297,7 @@ def test_rows_that_are_not_the_same_points_are_doubted(
     for t in range(_FRAMES):  # it bends, turns, travels and grows
         bent = shape + [0, 0, 1] * (0.1 * t * shape[:, :1] ** 2)
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        points = 1.5**t * bent @ turn + [20 * t, 0, 0]
+        points = unit * (1.5**t * bent @ turn + [20 * t, 0, 0])
         some = rng.permutation(count)[: int(mixed_up * count)]
         points[np.sort(some)] = points[some]
         np.save(tmp_path / "body" / f"{t}.npy", points.astype(np.float32))

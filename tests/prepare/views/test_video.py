@@ -462,6 +462,7 @@ def test_keep_takes_the_whole_picture(tmp_path):
         {"holes": "some"},
         {"radius": 0.0},
         {"elevation": 91.0},
+        {"elevation": -91.0},
         {"mask": Path("m"), "background": "white"},
         {"views_cameras": Path("c.json")},
         {"on_error": "go"},
