@@ -12,7 +12,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.likeness import file_like, tell_columns, tell_long, tell_rate, tell_unlike
-from dpcli.classify.data.videos import check_classes, report_backward, report_short, select_videos
+from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.video_scores import VideoScores, predict_videos
@@ -83,6 +83,7 @@ def predict(
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
         report_backward(reader, source.sequences)
+        report_gaps(reader, source.sequences)
         tell_unlike(str(path), file_like(reader, source.sequences), info, task.model)
         tell_columns(reader, source.sequences, info, task.model)
         tell_rate(reader, source.sequences, info, task.model)

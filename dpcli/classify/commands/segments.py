@@ -12,7 +12,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import choose_confidence
 from dpcli.classify.data.clips import check_columns
 from dpcli.classify.data.likeness import file_like, tell_columns, tell_rate, tell_unlike
-from dpcli.classify.data.videos import check_classes, report_empty, select_videos
+from dpcli.classify.data.videos import check_classes, report_empty, report_gaps, select_videos
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
@@ -75,13 +75,15 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
 
 
 def _tell_odd(reader: CloudsReader, chosen: Sequence[int], info: ModelInfo, window: int) -> None:
-    """Counts and names the recordings that one window sees whole, and those with frames without points, with a message each."""
+    """Counts and names the recordings that one window sees whole, those in which seconds passed without a frame, and those with frames
+    without points, with a message each."""
     short = [reader.names[i] for i in chosen if reader.frame_counts[i] < window]
     if short:
         log.info(
             f"{counted(len(short), 'recording')} of fewer than {counted(window, 'frame')}, a window, so one segment each:"
             f" {first_names(short)}"
         )
+    report_gaps(reader, chosen)
     if info.timing != "slots":
         report_empty(reader, chosen)
 

@@ -15,6 +15,7 @@ import numpy as np
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.likeness import like, tell_unlike, tell_values
+from dpcli.classify.data.videos import SILENT
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
 from dpcli.classify.stream.read_ahead import ReadAhead
@@ -29,7 +30,6 @@ from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import ScoresWriter
 
 _CTRL_C = "SIGINT"
-_SILENT = 2.0  # seconds without a frame that are told
 _SPARSE = 4  # points: fewer show no shape
 
 
@@ -212,7 +212,7 @@ class _IrregularFrames:
 
         number: how many frames with points came before it; silent: the seconds since the one before.
         """
-        if silent > _SILENT:
+        if silent > SILENT:
             if not self.gaps:
                 log.warn(
                     f"nothing came for {silent:.1f} s before frame {number}: the frames before and after it count as"

@@ -30,7 +30,7 @@ from dpcli.classify.data.validation_split import (
     default_rule,
     lasting_rule,
 )
-from dpcli.classify.data.videos import report_backward, report_short
+from dpcli.classify.data.videos import report_backward, report_gaps, report_short
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
@@ -171,9 +171,12 @@ def _train(
     schedule.share(processes.count)
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
-    for source in filter(None, (videos.training, videos.validation)):
+    sources = [source for source in (videos.training, videos.validation) if source is not None]
+    for source in sources:
         report_short(source, settings.network.num_frames)
-    report_backward(videos.training.reader, videos.training.sequences)
+    looked_at = sorted({i for source in sources for i in source.sequences})
+    report_backward(videos.training.reader, looked_at)
+    report_gaps(videos.training.reader, looked_at)
     torch.manual_seed(seed)
     model = _new_model(settings, videos, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, seed))

@@ -17,6 +17,9 @@ from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
+SILENT = 2.0  # seconds without a frame that are told
+_JUMP = 10  # times the usual step from frame to frame, at least: slow cameras are no news
+
 
 def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name: str) -> list[int]:
     """Returns the sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is
@@ -79,7 +82,16 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
 
 
 def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> None:
-    """Raises DataError, which names the first class in which the file and the model differ."""
+    """Raises DataError, which names the first class in which the file and the model differ, or, in a file that names no
+    classes, the first label that the model has no class for."""
+    unknown = np.flatnonzero(reader.labels >= len(info.class_names))
+    if not reader.class_names and len(unknown):
+        first = int(unknown[0])
+        raise DataError(
+            f"{reader.path}: label {reader.labels[first]} of {reader.names[first]!r}, and no names of classes;"
+            f" {model_name} has {counted(len(info.class_names), 'class')}, 0 to {len(info.class_names) - 1}; write"
+            " `class_names` into the file, or the model's numbers, or -1 where a video shows none of its classes"
+        )
     if reader.class_names and reader.class_names != info.class_names:
         pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
@@ -102,6 +114,24 @@ def report_backward(reader: CloudsReader, sequences: list[int]) -> None:
         log.warn(
             f"{reader.path}: time runs back in {len(names)} of {counted(len(sequences), 'video')}: {first_names(names)}"
             "; frames are taken in the file's order (is a recording cut wrongly?)"
+        )
+
+
+def report_gaps(reader: CloudsReader, sequences: Sequence[int]) -> None:
+    """Counts and names the videos in which seconds passed without a frame, with a message: what a network takes for
+    neighbors in time was none. Videos of a low rate have none, nor those whose time runs back."""
+    found = {}
+    for i in sequences:
+        steps = np.diff(time) if (time := reader.times(i)) is not None else np.zeros(0)
+        if len(steps) and (steps >= 0).all() and steps.max() > max(SILENT, _JUMP * np.median(steps)):
+            found[i] = int(steps.argmax()), float(steps.max())
+    if found:
+        longest = max(found, key=lambda i: found[i][1])
+        frame, seconds = found[longest]
+        log.warn(
+            f"{reader.path}: no frame for over {SILENT:g} s within {len(found)} of {counted(len(sequences), 'video')}:"
+            f" {first_names([reader.names[i] for i in found])} (at most {seconds:.3g} s, after frame {frame} of {reader.names[longest]});"
+            " the frames before and after count as neighbors: cut such recordings there"
         )
 
 

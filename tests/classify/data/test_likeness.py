@@ -21,9 +21,10 @@ from dpcli.classify.data.likeness import (
     tell_unlike,
     tell_values,
 )
-from dpcli.classify.data.videos import select_videos
+from dpcli.classify.data.videos import check_classes, report_gaps, select_videos
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import SHIPPED, ModelInfo
+from dpcli.errors import DataError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 
@@ -76,6 +77,40 @@ def test_training_videos_scored_for_want_of_test_videos_are_told(split, other, t
     chosen = select_videos(CloudsReader(tmp_path / "c.h5"), split, ModelInfo(KinetConfig(), ["a"]), "runs/own")
     assert chosen == ([1] if other == "test" else [0, 1, 2])
     assert ("no video is of the split 'test', so all are scored; 2 of 3 are" in capsys.readouterr().err) is told
+
+
+@pytest.mark.parametrize(
+    ("steps", "told"),
+    [
+        ([0.1] * 9, ""),
+        ([0.1] * 5 + [1.9] + [0.1] * 3, ""),
+        ([0.1] * 5 + [600] + [0.1] * 3, "over 2 s within 1 of 2 videos: v1 (at most 600 s, after frame 5 of v1)"),
+        ([3.0] * 9, ""),  # a slow camera
+        ([3.0] * 4 + [40.0] + [3.0] * 4, "at most 40 s, after frame 4 of v1"),
+        ([0.1] * 5 + [600] + [-1.0] * 3, ""),  # which is told by itself
+    ],
+)
+def test_seconds_without_a_frame_are_told(steps, told, capsys, tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", fields=["time"]) as writer:
+        for number, own in enumerate(([0.1] * 9, steps)):
+            sequence = CloudSequence.from_frames(f"v{number}", (body() * 3)[:10])
+            sequence.time = np.concatenate([[1e9], 1e9 + np.cumsum(own)])
+            writer.write(sequence)
+    report_gaps(CloudsReader(tmp_path / "c.h5"), [0, 1])
+    err = " ".join(capsys.readouterr().err.split())
+    assert told in err and bool(told) == bool(err)
+
+
+def test_a_label_that_the_model_has_no_class_for_is_refused_before_the_work(tmp_path):
+    with CloudsWriter(tmp_path / "c.h5") as writer:
+        for number, label in enumerate((0, 1, 17)):
+            writer.write(CloudSequence.from_frames(f"v{number}", body(), label=label))
+    reader = CloudsReader(tmp_path / "c.h5")
+    check_classes(reader, ModelInfo(KinetConfig(), [str(k) for k in range(18)]), "m")
+    with pytest.raises(
+        DataError, match=r"c\.h5: label 17 of 'v2', and no names of classes; m has 2 classes, 0 to 1; write"
+    ):
+        check_classes(reader, ModelInfo(KinetConfig(), ["a", "b"]), "m")
 
 
 def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):

@@ -86,6 +86,13 @@ def test_time_that_runs_backwards_is_told_and_left_out(model, tmp_path, capsys):
     assert all(not row["start_seconds"] for row in rows(said.out)["long"])
 
 
+def test_seconds_without_a_frame_are_told(model, tmp_path, capsys):
+    time = np.arange(30) / 10
+    time[20:] += 90
+    assert run(recordings(tmp_path / "c.h5", time), "--model", model, "-o", "-") == 0
+    assert "over 2 s within 1 of 2 videos: long (at most 90.1 s, after frame 19 of long)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "words, told",
     [
