@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+_LARGEST_TABLE = 4  # times the points: where ids are small, a table finds them several times as fast as a search
+
 
 @dataclass(frozen=True)
 class Overlap:
@@ -50,8 +52,18 @@ def overlap(truth: np.ndarray, part: np.ndarray) -> Overlap:
 
 def _compressed(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the ids that occur, ascending, and the index of each point's id among them; -1 for negative ids."""
-    found = np.unique(ids[ids >= 0])
-    return found, np.where(ids >= 0, np.searchsorted(found, ids), -1)
+    inside = ids >= 0
+    known = ids[inside]
+    largest = int(known.max()) if len(known) else -1
+    rows = np.full(len(ids), -1)
+    if largest > _LARGEST_TABLE * len(ids):
+        found = np.unique(known)
+        rows[inside] = np.searchsorted(found, known)
+        return found, rows
+    occurs = np.zeros(largest + 1, bool)
+    occurs[known] = True
+    rows[inside] = (np.cumsum(occurs) - 1)[known]
+    return np.flatnonzero(occurs).astype(ids.dtype), rows
 
 
 def valid_points(truth: np.ndarray, ignore_below: int = 0) -> np.ndarray:

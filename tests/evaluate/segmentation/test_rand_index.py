@@ -1,4 +1,4 @@
-"""Rand index and adjusted Rand index: scikit-learn's, by hand, and where they are undefined."""
+"""Rand index and adjusted Rand index: scikit-learn's, by hand, and where they are undefined; the overlap that they count."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
 
+from dpcli.evaluate.segmentation.part_overlap import overlap
 from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index, rand_index
 
 
@@ -47,3 +48,25 @@ def test_points_without_a_true_part_are_taken_out() -> None:
     assert adjusted_rand_index(np.append(truth[:4], -1), np.append(part[:4], 0)) == 1
     nothing = np.full(3, -1)
     assert np.isnan(rand_index(nothing, nothing)) and np.isnan(adjusted_rand_index(nothing, nothing))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from([-3, -1, 0, 2, 9, 200]), st.integers(-2, 3)), max_size=30),
+    st.sampled_from([np.int16, np.int32, np.int64]),
+    st.booleans(),
+)
+def test_overlap_counts_what_a_loop_counts_for_ids_of_every_size(pairs, kind, large) -> None:
+    truth, part = np.array(pairs, kind).reshape(-1, 2).T
+    if large:
+        part = np.where(part == 3, np.iinfo(kind).max, part)
+    found = overlap(truth, part)
+    ids, known = [sorted({i for i in own.tolist() if i >= 0}) for own in (truth, part)], [truth.tolist(), part.tolist()]
+    assert [found.truth_ids.tolist(), found.ids.tolist()] == ids and found.ids.dtype == kind
+    rows = [[own.index(i) if i >= 0 else -1 for i in one] for own, one in zip(ids, known)]
+    assert [found.truth_rows.tolist(), found.columns.tolist()] == rows
+    both = list(zip(*rows))
+    assert found.shared.tolist() == [[both.count((g, p)) for p in range(len(ids[1]))] for g in range(len(ids[0]))]
+    assert [found.truth_sizes.tolist(), found.sizes.tolist()] == [
+        [r.count(i) for i in range(len(o))] for r, o in zip(rows, ids)
+    ]
