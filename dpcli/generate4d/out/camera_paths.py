@@ -85,10 +85,11 @@ def pivot(scene: GaussianScene) -> np.ndarray:
 
 
 def home(scene: GaussianScene) -> tuple[float, float, float]:
-    """Returns azimuth, elevation and distance of the reference camera, seen from `pivot`."""
+    """Returns azimuth, elevation and distance of the reference camera, seen from `pivot`; as far as all reaches where it stands there."""
     pose = scene.camera_world_to_camera[scene.reference].copy()
     pose[:3, 3] += pose[:3, :3] @ pivot(scene)
-    return orbit_of(pose)
+    azimuth, elevation, distance = orbit_of(pose)
+    return azimuth, elevation, distance if distance > scene.near else scene.reach
 
 
 def own_rate(scene: GaussianScene) -> float:

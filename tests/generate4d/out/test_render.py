@@ -198,6 +198,15 @@ def test_cameras_turn_around_an_object_that_is_not_at_the_origin(away, scene, re
     np.testing.assert_array_equal(pivot(shifted(scene, moved / np.linalg.norm(moved) * 0.5)), 0)  # as ever
 
 
+def test_a_camera_in_the_middle_of_what_it_sees_turns_around_all_of_it(scene):
+    """As one that filmed a room: there is no direction from which it looks at the middle, and no distance."""
+    count = scene.num_gaussians // 2
+    mirrored = np.concatenate([scene.frame_mean[:, :count], -scene.frame_mean[:, :count]], 1)
+    inside = replace(scene, frame_mean=mirrored, camera_world_to_camera=np.stack([np.eye(4)] * 2))
+    shot = plan_shots(inside, "turntable", frames=2)[0]
+    assert np.isfinite(shot.world_to_camera).all() and orbit_of(shot.world_to_camera)[2] == pytest.approx(inside.reach)
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
 @pytest.mark.parametrize("color", ["appearance", "depth"])
 def test_a_scene_looks_the_same_in_any_unit(unit, color, scene, renderer):
