@@ -27,7 +27,7 @@ class RenderSettings:
         None, "Elevation of the camera above the horizon, degrees; none: the reference camera's.", least=-90, most=90
     )
     radius: float | None = setting(
-        None, "Distance of the camera from the origin, scene units; none: the reference camera's.", above=0
+        None, "Distance of the camera from what it turns around, scene units; none: the reference camera's.", above=0
     )
     fovy: float | None = setting(
         None, "Vertical field of view, degrees; none: the reference camera's.", above=0, below=180

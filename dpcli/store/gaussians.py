@@ -98,11 +98,15 @@ class GaussianScene:
         return color_of(self.sh)
 
     @property
+    def reach(self) -> float:
+        """Returns half the diagonal of the box around all means of all frames, and the largest standard deviation."""
+        extent = np.ptp(self.frame_mean.reshape(-1, 3).astype(np.float64), axis=0)
+        return float(np.linalg.norm(extent)) / 2 + float(self.scale.max())
+
+    @property
     def near(self) -> float:
         """Returns the least depth at which a camera sees a Gaussian: that of 3DGS, and less where the whole scene is small."""
-        extent = np.ptp(self.frame_mean.reshape(-1, 3).astype(np.float64), axis=0)
-        reach = float(np.linalg.norm(extent)) / 2 + float(self.scale.max())
-        return min(_NEAR, max(_NEAR_SHARE * reach, float(np.finfo(np.float32).tiny)))
+        return min(_NEAR, max(_NEAR_SHARE * self.reach, float(np.finfo(np.float32).tiny)))
 
     def require_times(self, asked: np.ndarray, path: object, asker: str) -> None:
         """Raises DataError where times f64 (n), seconds, lie outside the clip by more than half a frame: nothing is known then.

@@ -73,3 +73,14 @@ def in_unit(scene: GaussianScene, unit: float) -> GaussianScene:
     motion[..., :3, 3] *= np.float32(unit)
     sizes = scene.log_scale + np.float32(np.log(unit))
     return replace(scene, **lengths, part_motion=motion, log_scale=sizes, camera_world_to_camera=poses)
+
+
+def shifted(scene: GaussianScene, away: np.ndarray) -> GaussianScene:
+    """The same scene with all of it, cameras too, moved by `away` (3)."""
+    poses = scene.camera_world_to_camera.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ away
+    step = np.float32(away)
+    motion = scene.part_motion.copy()  # x + away to R x + t + away
+    motion[..., :3, 3] += step - motion[..., :3, :3] @ step
+    places = {name: getattr(scene, name) + step for name in ("mean", "frame_mean", "control_point", "control_position")}
+    return replace(scene, **places, part_motion=motion, camera_world_to_camera=poses)

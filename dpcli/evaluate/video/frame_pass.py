@@ -22,6 +22,7 @@ from dpcli.evaluate.video.sources.stored import SceneSource
 from dpcli.runtime.progress import Progress
 
 _RATE = 0.01  # how far apart two rates are the same
+_SOFT, _MANY = (0.1, 0.9), 20  # alpha in between, and pixels of such that can tell whether colors were multiplied by it
 Watch = Callable[[View, int, int, Picture, Picture], None]
 
 
@@ -54,6 +55,7 @@ class FramePass:
     brightest: tuple[int, int] = (0, 0)  # 8-bit color of the prediction, of the truth, until one is plausible
     hollow: int = 0  # predicted pictures without an object
     swapped: str = ""  # the first picture that seems to have red and blue swapped
+    multiplied: str = ""  # the side and the first picture whose colors seem multiplied by alpha
     misnumbered: str = ""  # the first frames whose names are numbered in different steps
 
     def score_views(self, pairs: Iterable[tuple[int, int]]) -> list[ViewScore]:
@@ -190,7 +192,7 @@ class FramePass:
         self.size = truth.size
 
     def _look_for_mistakes(self, predicted: Picture, truth: Picture, where: str) -> None:
-        """Notes what tells a broken prediction: 0..1 saved as 8 bits, no object, red and blue swapped."""
+        """Notes what tells broken pictures: 0..1 saved as 8 bits, no object, red and blue swapped, colors times alpha."""
         if self.brightest[0] <= 1 and predicted.rgba is not None and truth.rgba is not None:
             pair = (int(p.rgba[..., :3].max()) for p in (predicted, truth))
             self.brightest = tuple(max(*both) for both in zip(self.brightest, pair, strict=True))  # type: ignore
@@ -200,6 +202,10 @@ class FramePass:
             self.swapped = (
                 where if _red_and_blue_swapped(scaled(predicted, self.protocol), scaled(truth, self.protocol)) else ""
             )
+        if not self.multiplied and where.endswith("frame 0") and predicted.size == truth.size:
+            sides = (("prediction", predicted, truth), ("truth", truth, predicted))
+            found = (side for side, own, other in sides if _multiplied_by_alpha(own, other.over((1.0, 1.0, 1.0))))
+            self.multiplied = next((f"{side} ({where})" for side in found), "")
 
     def _check_plausible(self, scores: list[ViewScore], counts: list) -> None:
         if not scores and counts:
@@ -246,6 +252,11 @@ class FramePass:
                 f"Red and blue look swapped in the prediction ({self.swapped}): with them exchanged it is much "
                 "closer to the truth; was it saved as BGR?"
             )
+        if self.multiplied:
+            lines.append(
+                f"Colors look multiplied by alpha in the {self.multiplied}: read so, they are much closer to the other's; "
+                "straight alpha is expected."
+            )
         if self.hollow:
             lines.append(f"Predicted pictures without an object (alpha 0 everywhere): {self.hollow}.")
         return lines
@@ -266,6 +277,26 @@ def _red_and_blue_swapped(predicted: np.ndarray, truth: np.ndarray) -> bool:
     """Returns whether exchanging red and blue takes away nearly all of the error, of pictures f32 (3,H,W) in 0..1."""
     error, other = (float(np.square(p - truth).mean()) for p in (predicted, predicted[::-1]))
     return error > 1e-3 and other < 0.1 * error
+
+
+def _multiplied_by_alpha(picture: Picture, other: np.ndarray) -> bool:
+    """Returns whether colors that count as multiplied by alpha lose nearly all of their error where alpha is in between.
+
+    other: the other side's picture on white, f32 (3,H,W) in 0..1.
+    """
+    values = picture.values if picture.rgba is None else picture.rgba.astype(np.float32) / 255
+    alpha = values[..., 3]
+    soft = (alpha > _SOFT[0]) & (alpha < _SOFT[1])
+    if soft.sum() < _MANY or not np.isfinite(values).all():
+        return False
+    colors, alpha, other = values[soft, :3], alpha[soft, None], other[:, soft].T
+    straight = colors / alpha if picture.rgba is None else colors
+    if (straight > alpha + 0.01).any():
+        return False
+    error, read_so = (
+        float(np.square(shown - other).mean()) for shown in (straight * alpha + 1 - alpha, straight + 1 - alpha)
+    )
+    return error > 1e-3 and read_so < 0.1 * error
 
 
 def in_threads(work: Iterator[Callable[[], PictureStatistics]], progress: Progress) -> Iterator[PictureStatistics]:

@@ -14,6 +14,10 @@ from dpcli.store.gaussians import GaussianScene
 _SMOOTH = 24.0  # pictures per second that a moving camera needs at least
 _ROUND = 4.0  # seconds that the camera takes for its way, about: whole loops of the clip, so that the video loops, too
 _STILL_RATE = 15.0  # pictures per second of a scene of one frame
+_SOLID, _ENDS = 0.3, (0.01, 0.99)  # opacity of the object's Gaussians; quantiles of their places at its ends
+_MANY = 20_000  # places, about, that tell where these are
+# of half a picture: an object in the documented sphere, before the camera of an unknown clip, stays within
+_AWAY = 0.82
 _SWING, _BOB = np.deg2rad(35.0), np.deg2rad(20.0)
 
 
@@ -29,7 +33,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Lens:
-    """Describes a camera as far as a user does: radians and scene units; None stands for the scene's reference camera.
+    """Describes a camera as far as a user does: radians and scene units, about `pivot`; None stands for the reference camera's.
 
     size: pixels of the picture's longer side.
     """
@@ -42,14 +46,14 @@ class Lens:
 
     def place(self, scene: GaussianScene) -> tuple[float, float, float]:
         """Returns azimuth, elevation and radius, the reference camera's where they are None."""
-        reference = orbit_of(scene.camera_world_to_camera[scene.reference])
+        reference = home(scene)
         asked = (self.azimuth, self.elevation, self.radius)
         return tuple(default if value is None else value for value, default in zip(asked, reference))
 
     def sensor(self, scene: GaussianScene) -> tuple[np.ndarray, tuple[int, int]]:
         """Returns intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`, or with `fovy`.
 
-        Cameras on an orbit look at the origin, which is to be in the middle of their pictures wherever the reference has it.
+        Cameras on an orbit look at its middle, which is to be in the middle of their pictures wherever the reference has it.
         """
         width, height = scene.size
         zoom = self.size / max(width, height) if self.size else 1.0
@@ -65,6 +69,27 @@ class Lens:
         return np.diag([size[0] / scene.size[0], size[1] / scene.size[1], 1.0]) @ scene.camera_intrinsics[
             scene.reference
         ], size
+
+
+def pivot(scene: GaussianScene) -> np.ndarray:
+    """Returns the point f64 (3) that cameras turn around: the origin, or the object's middle where that is far from it.
+
+    Far is what a camera in the reference's place would have at its picture's border, or not at all, if it looked at the origin.
+    """
+    solid = scene.opacity >= min(_SOLID, scene.opacity.max())
+    places = scene.frame_mean[:: max(1, scene.num_frames // 8), solid].reshape(-1, 3).astype(np.float64)
+    middle = np.quantile(places[:: max(1, len(places) // _MANY)], _ENDS, axis=0).mean(0)
+    focal = scene.camera_intrinsics[scene.reference][[0, 1], [0, 1]]
+    half = orbit_of(scene.camera_world_to_camera[scene.reference])[2] * (scene.size / focal).min() / 2
+    return np.zeros(3) if np.linalg.norm(middle) <= _AWAY * half else middle
+
+
+def home(scene: GaussianScene) -> tuple[float, float, float]:
+    """Returns azimuth, elevation and distance of the reference camera, seen from `pivot`; as far as all reaches where it stands there."""
+    pose = scene.camera_world_to_camera[scene.reference].copy()
+    pose[:3, 3] += pose[:3, :3] @ pivot(scene)
+    azimuth, elevation, distance = orbit_of(pose)
+    return azimuth, elevation, distance if distance > scene.near else scene.reach
 
 
 def own_rate(scene: GaussianScene) -> float:
@@ -141,4 +166,7 @@ def _poses(scene: GaussianScene, path: str, lens: Lens, count: int) -> list[np.n
         azimuths = azimuth + _SWING * np.sin(turn)
     if path == "orbit":
         elevations = np.clip(elevation + _BOB * np.sin(turn), -np.pi / 2, np.pi / 2)
-    return [orbit_pose(a, e, radius) for a, e in zip(azimuths, elevations, strict=True)]
+    middle, poses = pivot(scene), [orbit_pose(a, e, radius) for a, e in zip(azimuths, elevations, strict=True)]
+    for pose in poses:
+        pose[:3, 3] -= pose[:3, :3] @ middle
+    return poses

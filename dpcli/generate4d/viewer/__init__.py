@@ -13,10 +13,9 @@ from dpcli import __version__
 from dpcli.draw.page import assemble
 from dpcli.draw.page.assemble import SHARED, STYLE, as_base64, as_json, filled, script_text, source_text
 from dpcli.draw.palette import part_colors
-from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
+from dpcli.generate4d.out.camera_paths import clip_rate, home, own_rate, pivot
 from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.generate4d.viewer.input_sheet import input_sheet
-from dpcli.ops.cameras import orbit_of
 from dpcli.standard_streams import printable
 from dpcli.store.gaussians import GaussianScene
 
@@ -103,8 +102,7 @@ def describe(
 ) -> dict[str, Any]:
     """Returns the page's header: counts, where each array begins, camera, parts, provenance."""
     low, extent = _box(scene)
-    lens, pose = scene.camera_intrinsics[scene.reference], scene.camera_world_to_camera[scene.reference]
-    azimuth, elevation, radius = orbit_of(pose)
+    lens, (azimuth, elevation, radius) = scene.camera_intrinsics[scene.reference], home(scene)
     starts = np.cumsum([0, *(values.nbytes for values in arrays.values())]).tolist()
     ids, counts = np.unique(scene.part, return_counts=True)
     return {
@@ -123,6 +121,7 @@ def describe(
             "azimuth": azimuth,
             "elevation": elevation,
             "radius": radius,
+            "target": pivot(scene).tolist(),
             "near": scene.near,
             "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
         },

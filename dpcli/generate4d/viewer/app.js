@@ -30,8 +30,8 @@ class App extends Stage {
   get camera() { return { ...super.camera, near: this.header.camera.near }; }
 
   home() {
-    const { azimuth, elevation, radius } = this.header.camera;
-    return { azimuth, elevation, radius, target: [0, 0, 0] };
+    const { azimuth, elevation, radius, target } = this.header.camera;
+    return { azimuth, elevation, radius, target };
   }
 
   painterOf(canvas) {

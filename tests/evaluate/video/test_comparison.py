@@ -169,6 +169,31 @@ def test_colors_saved_in_0_to_1_are_noticed(tmp_path: Path, truth: Path) -> None
         evaluate_video(tmp_path / "loud.npy", truth)
 
 
+@pytest.mark.parametrize("kind", ["views", "folder", "bytes.npy", "floats.npy"])
+def test_colors_that_were_multiplied_by_alpha_are_noticed(kind, tmp_path: Path) -> None:
+    """Of either side, in every kind of source; not where both agree, nor of straight colors that differ."""
+    straight, other = clip(views=1), clip(views=1)
+    slope = np.linspace(0, 255, WIDTH).round()
+    straight[..., 3] = other[..., 3] = slope
+    straight[..., 0], other[..., 0] = 200, 120
+    faded = straight.copy()
+    faded[..., :3] = np.rint(straight[..., :3] * (straight[..., 3:] / 255.0))
+    head = header(("reference",))
+
+    def source(name: str, pictures: np.ndarray) -> Path:
+        if kind == "views":
+            return write(tmp_path / f"{name}.h5", pictures, head)
+        if kind == "folder":
+            return write_folder(tmp_path / name, pictures[0])
+        np.save(tmp_path / f"{name}.npy", pictures if kind == "bytes.npy" else (pictures / 255).astype(np.float32))
+        return tmp_path / f"{name}.npy"
+
+    paths = {name: source(name, pictures) for name, pictures in (("a", straight), ("b", faded), ("c", other))}
+    for pair, side in (("ba", "prediction"), ("ab", "truth"), ("aa", ""), ("bb", ""), ("ca", ""), ("ac", "")):
+        notes = " ".join(evaluate_video(*(paths[name] for name in pair), metrics=("psnr",)).notes)
+        assert (f"multiplied by alpha in the {side} (" in notes) if side else "multiplied" not in notes, pair
+
+
 def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> None:
     values = (clip(1, noise=6) / 255).astype(np.float32)
     whole = tmp_path / "whole.npy"

@@ -12,7 +12,7 @@ import typer
 from dpcli.cli.generate4d.render import render
 from dpcli.draw.palette import PALETTE, part_colors
 from dpcli.errors import UsageError
-from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan_shots
+from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, pivot, plan_shots
 from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
 from dpcli.generate4d.out.render import Look, Renderer, render_views
 from dpcli.generate4d.render_settings import CATALOG
@@ -20,7 +20,7 @@ from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 from tests.support.commands import told
-from tests.support.scenes import in_unit, toy_scene
+from tests.support.scenes import in_unit, shifted, toy_scene
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +179,32 @@ def test_trails_follow_control_points_and_start_where_they_were(scene, renderer)
     bare = Renderer(toy_scene(per_part=120, size=48, controls=0))  # then Gaussians draw them
     assert (bare.picture(shot, Look(trajectories=True)) != plain).any()
     assert renderer.picture(shot, Look(trajectories=True, background=None)).shape == (48, 48, 4)
+
+
+@pytest.mark.parametrize("away", [(1.6, 0, 0), (0, 0, -3), (-30, 5, 9)])
+def test_cameras_turn_around_an_object_that_is_not_at_the_origin(away, scene, renderer):
+    """As in a world that a stranger's program made: its own camera stands as before, seen from the object."""
+    other, moved = Renderer(shifted(scene, np.array(away))), np.float64(away)
+    for path in ("fixed", "orbit"):
+        here, there = (plan_shots(drawn.scene, path, frames=5) for drawn in (renderer, other))
+        for one, two in zip(here, there, strict=True):
+            middle = (
+                other.scene.frame_mean.reshape(-1, 3).astype(float) @ two.world_to_camera[:3, :3].T
+                + two.world_to_camera[:3, 3]
+            )
+            pixels = (middle @ two.intrinsics.T)[:, :2] / middle[:, 2:]
+            assert (middle[:, 2] > 0).all() and (0 < pixels).all() and (pixels < 48).all()
+            assert one.time == two.time
+    np.testing.assert_array_equal(pivot(shifted(scene, moved / np.linalg.norm(moved) * 0.5)), 0)  # as ever
+
+
+def test_a_camera_in_the_middle_of_what_it_sees_turns_around_all_of_it(scene):
+    """As one that filmed a room: there is no direction from which it looks at the middle, and no distance."""
+    count = scene.num_gaussians // 2
+    mirrored = np.concatenate([scene.frame_mean[:, :count], -scene.frame_mean[:, :count]], 1)
+    inside = replace(scene, frame_mean=mirrored, camera_world_to_camera=np.stack([np.eye(4)] * 2))
+    shot = plan_shots(inside, "turntable", frames=2)[0]
+    assert np.isfinite(shot.world_to_camera).all() and orbit_of(shot.world_to_camera)[2] == pytest.approx(inside.reach)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])

@@ -21,7 +21,7 @@ from dpcli.generate4d.viewer import packed, write_page
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
 from tests.support.browser import PRESSED, needs_browser, open_page
-from tests.support.scenes import in_unit, toy_scene
+from tests.support.scenes import in_unit, shifted, toy_scene
 
 WIDTH, HEIGHT = 420, 320
 _FLAGS = (
@@ -115,6 +115,17 @@ def test_a_page_opens_where_the_camera_stands(unit, radius, scene, tmp_path):
     difference = np.abs(ours.astype(int) - shown.pixels)
     assert (ours != ours[0, 0]).any(-1).mean() > 0.1 and difference.mean() < 0.5
     assert np.quantile(difference, 0.999) <= 12
+
+
+@needs_browser
+def test_a_page_opens_on_an_object_that_is_not_at_the_origin(scene, tmp_path):
+    away = np.array([7.0, -2, 3])
+    write_page(shifted(scene, away), tmp_path / "away.html", title="away")
+    shown = show(tmp_path / "away.html", "time=0.5&controls=0", tmp_path)
+    apart = shown.pixels.astype(int).min(-1) < 128
+    row, column = np.nonzero(apart)
+    assert apart.mean() > 0.05 and abs(column.mean() - WIDTH / 2) < 20 and abs(row.mean() - HEIGHT / 2) < 40
+    assert min(row.min(), column.min()) > 5 and row.max() < HEIGHT - 5 and column.max() < WIDTH - 5
 
 
 @needs_browser
