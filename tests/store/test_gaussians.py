@@ -192,7 +192,9 @@ def test_derived_values():
     np.testing.assert_allclose(scene.opacity, 1 / (1 + np.exp(-2.2)), rtol=1e-6)
     assert replace(scene, opacity_logit=np.full(300, -200, np.float32)).opacity.max() == 0
     np.testing.assert_allclose(scene.color[[0, -1]], [[217, 38, 26], [26, 64, 230]], atol=1)
-    np.testing.assert_allclose(replace(scene, sh=np.ones_like(scene.sh)).color, 255 * (0.5 + 0.5 / np.sqrt(np.pi)), atol=1)
+    np.testing.assert_allclose(
+        replace(scene, sh=np.ones_like(scene.sh)).color, 255 * (0.5 + 0.5 / np.sqrt(np.pi)), atol=1
+    )
     np.testing.assert_allclose(scene.scale[0], [0.05, 0.03, 0.03], rtol=1e-6)
 
 
