@@ -144,6 +144,22 @@ def test_a_damaged_file_is_refused(tmp_path):
         read_scene(path)
 
 
+@pytest.mark.parametrize("fine", [False, True])
+def test_half_a_frame_beyond_the_ends_is_of_the_clip(fine):
+    scene = toy_scene()
+    step = float(np.diff(scene.time).min()) / (5 if fine else 1)  # the finer of both counts
+
+    def asked(late: float) -> np.ndarray:
+        last = scene.time[-1] + late * step
+        return np.array([last - step, last]) if fine else np.array([last])
+
+    scene.require_times(asked(0.49), "s.h5", "more")
+    scene.require_times(scene.time[0] + (scene.time[-1] - asked(0.49))[::-1], "s.h5", "more")
+    for times in (asked(0.51), scene.time[0] + (scene.time[-1] - asked(0.51))[::-1]):
+        with pytest.raises(DataError, match="s.h5: holds .* s, but more"):
+            scene.require_times(times, "s.h5", "more")
+
+
 def test_at_a_frame_is_that_frame_and_the_ends_hold():
     scene = toy_scene()
     for t, time in enumerate(scene.time):
@@ -178,6 +194,9 @@ def test_derived_values():
     np.testing.assert_allclose(scene.opacity, 1 / (1 + np.exp(-2.2)), rtol=1e-6)
     assert replace(scene, opacity_logit=np.full(300, -200, np.float32)).opacity.max() == 0
     np.testing.assert_allclose(scene.color[[0, -1]], [[217, 38, 26], [26, 64, 230]], atol=1)
+    np.testing.assert_allclose(
+        replace(scene, sh=np.ones_like(scene.sh)).color, 255 * (0.5 + 0.5 / np.sqrt(np.pi)), atol=1
+    )
     np.testing.assert_allclose(scene.scale[0], [0.05, 0.03, 0.03], rtol=1e-6)
 
 

@@ -123,7 +123,7 @@ def cross_folds(reader: CloudsReader, chosen: list[int], members: int, seed: int
     """Returns the member, of `members`, that must not learn from each of the videos: whole people where at least two are known."""
     subjects = reader.subjects[chosen]
     people = len(set(subjects.tolist()))
-    count = min(members, people) if people > 1 and subjects.min() >= 0 else min(members, len(chosen))
+    count = min(members, people) if people > 1 and subjects.min() >= 0 else members
     return dict(zip(chosen, folds(reader.labels[chosen], subjects, count, seed).tolist()))
 
 

@@ -139,6 +139,9 @@ def test_clips_of_a_video_that_stay_together_come_from_all_its_parts(reader, tim
         assert starts == sorted(starts)
         if timing == "clips":
             assert all(first in part for (first, *_), part in zip(starts, ((0, 1), (2, 3), (4, 5, 6))))
+    if timing == "clips":  # of four frames there is one start, whatever the part
+        one = [ClipSource(reader, [1], CONFIG, seed=5).epoch(number, 3, together=True) for number in range(20)]
+        assert {clip.frames for clips in one for clip in clips} == {(0, 1, 2, 3)}
     seen = {clip.frames for number in range(60) for clip in source.epoch(number, 3, together=True)}
     assert seen >= {clip.frames for clip in source.clips(None) if timing == "clips"}
 
@@ -165,7 +168,7 @@ def test_normalizations():
     assert np.isclose(image[..., 2].std(), 1, atol=1e-4) and normalize(points, "none") is points
     flat = points.copy()
     flat[..., 2] = 5
-    assert np.isfinite(normalize(flat, "image")).all()
+    assert np.isfinite(normalize(flat, "image")).all() and not normalize(np.ones_like(flat), "unit").any()
 
 
 def _body(tall: float, frames: int = 6) -> np.ndarray:

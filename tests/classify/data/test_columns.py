@@ -25,12 +25,13 @@ SENSELESS = {
     "noise": "might as well be drawn at random",
     "number of 8": "might as well be drawn at random",
 }
-TELLING = ("speed", "intensity", "angle")
+TELLING = ("speed", "intensity", "angle", "error")
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    """Thirty videos of three classes; the speed goes with the class, the intensity with the distance, the angle with x."""
+    """Thirty videos of three classes; the speed goes with the class, the intensity with the distance, the angle with x,
+    and of the error the spread alone with the class."""
     rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("columns") / "c.h5"
     points = 0
     with CloudsWriter(path, class_names=list("abc"), fields=list(map(kept_name, (*TELLING, *SENSELESS)))) as writer:
@@ -44,6 +45,7 @@ def file(tmp_path_factory):
                 "speed": rng.normal(k % 3 - 1, 1, count),
                 "intensity": 1 / np.linalg.norm(video.points, axis=1) + rng.normal(0, 0.05, count),
                 "angle": np.arctan2(video.points[:, 0], video.points[:, 2]),
+                "error": np.random.default_rng(k).normal(0, 1 + k % 3, count),
                 "row": row,
                 "line of the table": points + np.arange(count),
                 "frame": frame,

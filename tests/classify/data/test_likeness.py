@@ -167,12 +167,14 @@ def test_another_frame_rate_is_told_where_clips_are_consecutive_frames(rates, mo
 )
 def test_columns_in_another_unit_or_without_values_are_told(speed, said, capsys, tmp_path):
     rng = np.random.default_rng(0)
-    with CloudsWriter(tmp_path / "c.h5", fields=["field_v"]) as writer:
+    with CloudsWriter(tmp_path / "c.h5", fields=["field_u", "field_v"]) as writer:
         for name in ("a", "b"):
             sequence = CloudSequence.from_frames(name, [one[:100] for one in body()[:3]])
-            sequence.extra = {"field_v": (speed * rng.uniform(-1, 1, 300)).astype(np.float32)}
+            values = {"field_v": speed * rng.uniform(-1, 1, 300), "field_u": rng.uniform(-100, 100, 300)}
+            sequence.extra = {name: own.astype(np.float32) for name, own in values.items()}
             writer.write(sequence)
-    config = KinetConfig(backbone="slots", widths=((64, 64), (96,)), columns=("v",), scales=(0.3, 0.0, 0.8))
+    columns, scales = ("u", "v"), (0.3, 0.0, 80.0, 0.0, 0.8)
+    config = KinetConfig(backbone="slots", widths=((64, 64), (96,)), columns=columns, scales=scales)
     tell_columns(CloudsReader(tmp_path / "c.h5"), [0, 1], ModelInfo(config, ["a"], "slots"), "runs/own")
     err = " ".join(capsys.readouterr().err.split())
     assert said in err and bool(said) == bool(err)

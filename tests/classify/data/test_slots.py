@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from dpcli.classify.data.augment import NONE
 from dpcli.classify.data.augment import SPARSE as CHANGE
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.slots import changed_rows, in_slots, measured, preset_for, slot_rows
+from dpcli.classify.data.slots import changed_rows, in_slots, measured, measured_scales, preset_for, slot_rows
 from dpcli.classify.data.validation_split import (
     about_classes,
     about_people,
@@ -83,6 +85,20 @@ def test_place_and_unit_of_the_data_make_no_difference(tmp_path):
     assert np.allclose(slot_rows(video(), config), slot_rows(millimeters, again), atol=1e-3)
 
 
+def test_speeds_count_by_their_video_s_level_and_other_columns_from_its_middle():
+    fields = ("speed", "snr")
+    config = network_config(Given("sparse", sets=SMALL), 2)
+    config = config.changed(columns=fields, scales=(1.0, 0.0, 1.0, 4.0, 2.0))
+    rng = np.random.default_rng(0)
+    for speed in (rng.normal(-0.8, 0.4, 40), rng.normal(0, 0.01, 40), rng.normal(2, 4, 40)):
+        snr = rng.normal(5, 9, 40)
+        made = CloudSequence.from_frames("v", list(rng.normal(0, 0.1, (8, 5, 3)).astype(np.float32)))
+        made.extra = {kept_name(name): own.astype(np.float32) for name, own in zip(fields, (speed, snr))}
+        level = max(np.sort(np.abs(speed))[31] * 0.8 + np.sort(np.abs(speed))[32] * 0.2, 0.1)  # of 40, the quantile 0.8
+        expected = np.stack([speed * 2 / (1 + level), (snr - np.median(snr)) / 2], axis=1).clip(-3, 3)
+        np.testing.assert_allclose(slot_rows(made, config)[:, 4:], expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("points", [1, 2])
 def test_a_video_of_one_frame_or_point_makes_a_clip(tmp_path, points):
     config = config_of(tmp_path, [video()])
@@ -123,6 +139,51 @@ def test_changes_keep_the_order_in_time_and_change_speeds_together(tmp_path):
     assert len(changed) < len(rows) and (np.diff(changed[:, 3]) >= 0).all()
     assert len(np.unique(np.abs(changed[:, 4]))) == 1 and not np.allclose(np.abs(changed[:, 4]), 1)
     assert np.allclose(rows, slot_rows(video(frames=40), config))  # the rows themselves stay
+
+
+def test_each_change_of_sparse_rows_is_the_one_that_it_names():
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.normal(size=(300, 3)), np.sort(rng.random(300)), np.arange(300), np.ones(300)])
+    rows = rows.astype(np.float32)
+
+    def changed(seed, **ranges):
+        return changed_rows(rows, replace(NONE, **ranges), [1], np.random.default_rng(seed))
+
+    for seed in range(20):
+        moved = changed(seed, shift=0.2)
+        step = moved[:, :3] - rows[:, :3]
+        assert np.allclose(step, step[0], atol=1e-5) and 0 < np.abs(step).max() < 0.2001
+        assert np.array_equal(moved[:, 3:], rows[:, 3:])
+        faster = changed(seed, speed=0.5)
+        assert np.allclose(faster[:, :5], rows[:, :5], atol=1e-5) and len(np.unique(faster[:, 5])) == 1
+        assert 1 / 1.5001 < faster[0, 5] < 1.5001 and abs(faster[0, 5] - 1) > 1e-4
+        cut = changed(seed, crop=0.3)
+        kept = cut[:, 4].astype(int)
+        slope, start = np.polyfit(rows[kept, 3], cut[:, 3], 1)  # the kept stretch fills the time, or leaves rests
+        assert 1 / 1.6 < slope < 1 / 0.4 and np.allclose(cut[:, 3], slope * rows[kept, 3] + start, atol=1e-5)
+        late = slope * rows[:, 3] + start
+        assert kept.tolist() == np.flatnonzero((late >= 0) & (late < 1)).tolist()
+        assert -0.3001 < -start / slope < 0.3001 and -0.3001 < 1 - (1 - start) / slope < 0.3001
+    lost = [1 - len(changed(seed, dropout=0.5)) / 300 for seed in range(40)]
+    assert min(lost) < 0.05 and 0.42 < max(lost) < 0.58
+
+
+def test_scales_are_medians_of_the_videos_and_of_their_columns(tmp_path):
+    rng = np.random.default_rng(0)
+    made = [video(f"v{k}", frames=9 + k, seed=k) for k in range(3)]
+    for one in made:
+        values = {SPEED: rng.normal(0.5, 2, len(one.points)), kept_name("snr"): rng.gamma(2, 3, len(one.points))}
+        one.extra = {name: own.astype(np.float32) for name, own in values.items()}
+        one.extra[kept_name("snr")][3] = np.nan
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a", "b"], fields=[SPEED, kept_name("snr")]) as writer:
+        for one in made:
+            writer.write(one)
+    found = measured_scales(CloudsReader(tmp_path / "c.h5"), [0, 1, 2], ("speed", "snr"))
+    away = [np.linalg.norm(one.points - np.median(one.points, axis=0), axis=1) for one in made]
+    speed, snr = (np.concatenate([one.extra[name] for one in made]) for name in (SPEED, kept_name("snr")))
+    spreads = [np.ptp(np.nanquantile(own, [0.1, 0.9])) / 2 for own in (speed, snr)]
+    expected = [2 * np.median(np.concatenate(away)), 0, spreads[0], np.nanmedian(snr), spreads[1]]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):

@@ -22,6 +22,8 @@ def test_a_cosine_rises_for_a_tenth_and_ends_near_zero():
     assert static[0] == pytest.approx(0.2 / 100) and max(static) == static[99] == static[100] == 0.2
     assert all(a > b for a, b in zip(static[100:], static[101:])) and 0 < static[-1] < 1e-6
     assert static[1050] == pytest.approx(0.1)  # half way
+    short = [learning_rate(schedule, 0, step, 200) for step in range(200)]
+    assert short[:20] == pytest.approx([0.01 * (step + 1) for step in range(20)]) and short[20] == 0.2 > short[21]
     assert [learning_rate(schedule, 1, step, 2000) for step in range(2000)] == pytest.approx([r / 2 for r in static])
 
 

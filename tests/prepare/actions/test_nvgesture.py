@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.actions.nvgesture import INTRINSICS, ListEntry, NvGesture, foreground, parse_line
+from dpcli.prepare.actions.nvgesture import ListEntry, NvGesture, foreground, parse_line
 from tests.support.prepare_helpers import write_video
 
 RNG = np.random.default_rng(0)
@@ -134,9 +134,9 @@ def test_camera_coordinates_project_back_onto_the_pixels(tmp_path):
     row, column, gray = image.read(item, RNG).sequence.points.T
     x, y, z = camera.read(item, RNG).sequence.points.T
     np.testing.assert_allclose(z, 255 - gray)
-    # of pixels that are four times as wide and high as those of the data set, counted from the middle of the first
-    np.testing.assert_allclose((x / z * INTRINSICS.fx + INTRINSICS.cx + 0.5) / 4 - 0.5, column, atol=1e-3)
-    np.testing.assert_allclose((y / z * INTRINSICS.fy + INTRINSICS.cy + 0.5) / 4 - 0.5, row, atol=1e-3)
+    # the data set's focal lengths and center, of pixels four times as wide and high, counted from the middle of the first
+    np.testing.assert_allclose((x / z * 224.502 + 160.5) / 4 - 0.5, column, atol=1e-3)
+    np.testing.assert_allclose((y / z * 230.494 + 120.5) / 4 - 0.5, row, atol=1e-3)
 
 
 def test_of_several_lists_it_is_told_which_is_read(tmp_path):
@@ -229,5 +229,6 @@ def test_videos_that_were_encoded_again_are_told(tmp_path, shape, fps, told):
     video = np.zeros((8, *shape), np.uint8)
     video[:, 20:60, 20:80] = 150
     write_video(item.path, video, fps=fps)
-    notes = reader.read(item, RNG).notes
-    assert [told in note for note in notes] == [True] * bool(told)
+    sample = reader.read(item, RNG)
+    assert [told in note for note in sample.notes] == [True] * bool(told)
+    np.testing.assert_allclose(sample.sequence.time, np.arange(3) / fps)

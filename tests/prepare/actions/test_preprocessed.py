@@ -212,6 +212,9 @@ def test_pts_label_of_nvgesture(tmp_path):
     good, bad = PtsLabel(tmp_path).items()
     assert (good.label, good.subject) == (2, 7) and "class 26 is out of range; expected 1 to 25" in bad.problem
     assert "nearer = larger" in PtsLabel(tmp_path).length_unit and len(PtsLabel(tmp_path).class_names) == 25
+    write_pts(tmp_path, "more/class_03/subject7_r1")
+    (twice,) = (item for item in PtsLabel(tmp_path).items() if "more" in item.name)
+    assert good.name == "class_03/subject7_r1" and f"{good.name} is there twice; {good.path} is read" in twice.problem
 
 
 @pytest.mark.parametrize("folder", ["", "gesture_data/"])  # the name of a folder above says nothing

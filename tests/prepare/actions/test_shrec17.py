@@ -250,6 +250,10 @@ def test_regions_over_the_edge_are_cut_and_counted(tmp_path):
     assert sample.notes == {"hand regions cut at the edge of the image": 2}
     counts = [np.count_nonzero(hand_depth(0)[0][0:131, 0:240]), 0, np.count_nonzero(hand_depth(0)[2][90:, 230:])]
     assert np.diff(sample.sequence.frame_offsets)[[0, 2]].tolist() == [counts[0], counts[2]]
+    by_one_pixel = ((-1, 90, 70, 80), (190, -1, 70, 181), (600, 90, 41, 80), (190, 90, 70, 391))
+    for over in by_one_pixel:
+        write_gesture(root, A, hand_depth(0), [over, REGION, REGION])
+        assert reader.read(reader.items()[0], RNG).notes["hand regions cut at the edge of the image"] == 1
 
 
 def test_regions_are_read_as_written(tmp_path):
