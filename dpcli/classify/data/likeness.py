@@ -158,6 +158,13 @@ def tell_values(
         )
 
 
+def tell_unlike_file(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
+    """Warns where videos of a file are unlike what a model learned from: in size and density, columns, or frame rate."""
+    tell_unlike(str(reader.path), file_like(reader, sequences), info, model)
+    tell_columns(reader, sequences, info, model)
+    tell_rate(reader, sequences, info, model)
+
+
 def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str | Path) -> None:
     """Warns where videos are much larger, smaller, denser or sparser than those that a model learned from.
 
