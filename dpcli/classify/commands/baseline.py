@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.descriptors import descriptors
+from dpcli.classify.data.likeness import tell_mixed_sizes
 from dpcli.classify.data.validation_split import about_other_splits
 from dpcli.counted import counted
 from dpcli.errors import DataError
@@ -72,6 +73,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         _tell_left_out(reader, known)
+        tell_mixed_sizes(reader, known.tolist())
         tell_copies(reader, [(known[learned].tolist(), known[judged].tolist()) for learned, judged in rounds])
         for learned, judged in rounds:
             scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)

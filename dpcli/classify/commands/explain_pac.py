@@ -14,7 +14,8 @@ import torch
 from dpcli.classify.commands.explain_inputs import check_targets, chosen_streams
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.videos import check_classes, report_short, select_videos
+from dpcli.classify.data.likeness import tell_unlike_file
+from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
 from dpcli.classify.explain.pac_settings import PacSettings
 from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
@@ -78,6 +79,9 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
         sequences = chosen_samples(reader, request.samples, pool)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=task.seed)
         report_short(source, info.config.num_frames)
+        report_backward(reader, source.sequences)
+        report_gaps(reader, source.sequences)
+        tell_unlike_file(reader, source.sequences, info, task.model)
         entry = provenance.record(_record(task, weights, request, streams, info), task.seed, {"clouds": path})
         clouds = _explain(model.to(device), source, streams, question, device)
         write_clouds(

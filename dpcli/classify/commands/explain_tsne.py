@@ -11,7 +11,8 @@ import numpy as np
 from dpcli.classify.commands.explain_inputs import check_targets, chosen_streams
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.videos import check_classes, report_short, select_videos
+from dpcli.classify.data.likeness import tell_unlike_file
+from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
 from dpcli.classify.explain.pictures import plane_picture
 from dpcli.classify.explain.tsne import (
     NEIGHBORS,
@@ -100,6 +101,9 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
         kept = source.sequences
         perplexity = chosen_perplexity(request.perplexity, len(kept))
         report_short(source, info.config.num_frames)
+        report_backward(reader, source.sequences)
+        report_gaps(reader, source.sequences)
+        tell_unlike_file(reader, source.sequences, info, task.model)
         keep_freed_memory()
         features = video_features(model.to(device), source, request.clips_per_video, request.batch, device)
         if "fused" in streams:

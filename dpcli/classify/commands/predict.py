@@ -11,7 +11,7 @@ from typing import Any
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.likeness import file_like, tell_columns, tell_long, tell_rate, tell_unlike
+from dpcli.classify.data.likeness import tell_long, tell_unlike_file
 from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
@@ -84,9 +84,7 @@ def predict(
         report_short(source, info.config.num_frames)
         report_backward(reader, source.sequences)
         report_gaps(reader, source.sequences)
-        tell_unlike(str(path), file_like(reader, source.sequences), info, task.model)
-        tell_columns(reader, source.sequences, info, task.model)
-        tell_rate(reader, source.sequences, info, task.model)
+        tell_unlike_file(reader, source.sequences, info, task.model)
         tell_long(reader, source.sequences, info, task.model)
         config = _record(task, weights, info, source, clips_per_video)
         confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)

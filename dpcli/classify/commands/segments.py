@@ -11,7 +11,7 @@ import numpy as np
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import choose_confidence
 from dpcli.classify.data.clips import check_columns
-from dpcli.classify.data.likeness import file_like, tell_columns, tell_rate, tell_unlike
+from dpcli.classify.data.likeness import tell_unlike_file
 from dpcli.classify.data.videos import check_classes, report_empty, report_gaps, select_videos
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
@@ -56,9 +56,7 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
         check_classes(reader, info, task.model)
         check_columns(reader, info.config)
         chosen = select_videos(reader, task.split, info, task.model)
-        tell_unlike(str(path), file_like(reader, chosen), info, task.model)
-        tell_columns(reader, chosen, info, task.model)
-        tell_rate(reader, chosen, info, task.model)
+        tell_unlike_file(reader, chosen, info, task.model)
         _tell_odd(reader, chosen, info, how.window)
         keep_freed_memory()
         recordings = {}

@@ -242,7 +242,7 @@ class _IrregularFrames:
                 self._first = []
         if len(seen) < _SPARSE and not self._few:
             if not self.sparse:
-                log.warn(f"frame {number} has {len(seen)} points, repeated to fill a clip; reported once")
+                log.warn(f"frame {number} has {counted(len(seen), 'point')}, repeated to fill a clip; reported once")
             self.sparse += 1
         return seen
 

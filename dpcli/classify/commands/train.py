@@ -16,8 +16,15 @@ from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.copies import tell_copies
+from dpcli.classify.data.likeness import (
+    ANY_UNIT,
+    file_like,
+    tell_mixed_rates,
+    tell_mixed_sizes,
+    tell_rounded,
+    tell_unlike,
+)
 from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
-from dpcli.classify.data.likeness import file_like, tell_mixed_rates, tell_rounded, tell_unlike
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     about_absent_classes,
@@ -269,6 +276,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
     tell_mixed_rates(reader, training, run.timing)
+    if settings.network.normalize not in ANY_UNIT:
+        tell_mixed_sizes(reader, sorted({*training, *validation}))
     left_out: dict[str, str] = {}
     if run.timing == "slots" and not settings.network.scales:
         network, left_out = measured(settings.network, reader, training)

@@ -19,6 +19,8 @@ from dpcli.store.schema import kept_name
 NOTE = "learned_from"  # in a model's notes: `like`
 _VIDEOS, _FRAMES = 50, 8  # looked at, evenly over a file and over a video
 _OTHER_UNIT, _OTHER_SENSOR = 3.0, 10.0  # times as large, times as many points
+_MIXED_UNITS = 10.0  # times as large as the median video: people and gestures differ less, units more
+ANY_UNIT = ("height", "unit")  # normalizations after which the unit makes no difference
 _RESTING = 10.0  # times as little as in training that a column may vary: who moves little has low speeds
 _MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
@@ -46,17 +48,37 @@ def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
     """Returns `like` in the median of some videos of a file, and of all of them the frames of the longest and, where their times
     are known, the median seconds from frame to frame."""
-    found = []
-    for number in list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]:
-        count = int(reader.frame_counts[number])
-        shown = range(0, count, -(-count // _FRAMES))
-        video = reader.read(number, shown, fields=())
-        found.append(like([video.frame(t) for t in range(video.num_frames)]))
-    found = [one for one in found if one]
+    found = list(_looks(reader, sequences).values())
     middle = {key: float(np.median([one[key] for one in found])) for key in (found[0] if found else ())}
     intervals = list(_intervals(reader, sequences).values())
     rate = {"interval": float(np.median(intervals))} if intervals else {}
     return {**middle, **rate, "frames": float(reader.frame_counts[list(sequences)].max(initial=0))}
+
+
+def _looks(reader: CloudsReader, sequences: Sequence[int]) -> dict[int, dict[str, float]]:
+    """Returns `like` of some videos, evenly over these, by sequence; those without points are left out."""
+    found = {}
+    for number in list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]:
+        count = int(reader.frame_counts[number])
+        shown = range(0, count, -(-count // _FRAMES))
+        video = reader.read(number, shown, fields=())
+        found[number] = like([video.frame(t) for t in range(video.num_frames)])
+    return {number: one for number, one in found.items() if one}
+
+
+def tell_mixed_sizes(reader: CloudsReader, sequences: Sequence[int]) -> None:
+    """Warns where some videos of a file are so much larger or smaller than its median one that they have another unit."""
+    extents = {i: one["extent"] for i, one in _looks(reader, sequences).items() if one["extent"] > 0}
+    usual = float(np.median(list(extents.values()))) if extents else 0.0
+    others = [i for i, own in extents.items() if not usual / _MIXED_UNITS < own < usual * _MIXED_UNITS]
+    if others:
+        one = others[0]
+        log.warn(
+            f"{reader.path}: {len(others)} of {counted(len(extents), 'video')} looked at {'is' if len(others) == 1 else 'are'} over"
+            f" {_MIXED_UNITS:g} times as large or small as the median one (half of the points of {reader.names[one]} lie within"
+            f" {extents[one]:.3g} of the middle, {usual:.3g} in the median): is their unit of length another one? Bring all into one:"
+            " prepare the others again, clouds with --scale, depth videos with --depth-scale"
+        )
 
 
 def _intervals(reader: CloudsReader, sequences: Sequence[int]) -> dict[int, float]:
@@ -158,6 +180,15 @@ def tell_values(
         )
 
 
+def tell_unlike_file(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
+    """Warns where videos of a file are unlike what a model learned from: in size and density, columns, or frame rate."""
+    tell_unlike(str(reader.path), file_like(reader, sequences), info, model)
+    if info.config.normalize not in ANY_UNIT:
+        tell_mixed_sizes(reader, sequences)
+    tell_columns(reader, sequences, info, model)
+    tell_rate(reader, sequences, info, model)
+
+
 def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str | Path) -> None:
     """Warns where videos are much larger, smaller, denser or sparser than those that a model learned from.
 
@@ -166,7 +197,7 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
     tell_rounded(what, theirs)
     own = _own(info, model)
     size, far = own.get("extent"), theirs.get("extent")
-    in_units = info.config.normalize not in ("height", "unit")
+    in_units = info.config.normalize not in ANY_UNIT
     if size and far is not None and in_units and not size / _OTHER_UNIT < far < size * _OTHER_UNIT:
         log.warn(
             f"{what}: half of the points lie within {far:.3g} of the middle, within {size:.3g} in what {model} learned from:"

@@ -137,7 +137,8 @@ def report_gaps(reader: CloudsReader, sequences: Sequence[int]) -> None:
 
 def report_short(source: ClipSource, frames: int) -> None:
     """Names the videos that are dropped or padded, and those with frames without points, with a message each."""
-    for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding the last frame")):
+    longer = "each frame shown several times" if source.timing == "uniform" else "padded by holding the last frame"
+    for names, what in ((source.dropped, "dropped"), (source.padded, longer)):
         if names:
             log.info(f"{counted(len(names), 'video')} of fewer than {frames} frames, {what}: {first_names(names)}")
     if source.timing != "slots":

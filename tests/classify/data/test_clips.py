@@ -113,6 +113,16 @@ def test_short_videos_are_padded_or_dropped_and_named(reader):
         ClipSource(reader, [0], CONFIG, drop_short=True)
 
 
+@pytest.mark.parametrize(
+    "timing, shown, told", [("clips", (0, 1, 1, 1), "padded by holding"), ("uniform", (0, 0, 1, 1), "each")]
+)
+def test_what_becomes_of_a_short_video_is_told_as_it_is(reader, timing, shown, told, capsys):
+    source = ClipSource(reader, [0], CONFIG, timing=timing)
+    assert source.clips(1)[0].frames == shown
+    report_short(source, 4)
+    assert f"1 video of fewer than 4 frames, {told}" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_clip_holds_its_frames_in_order(reader):
     source = ClipSource(reader, [2], CONFIG)
     points = source.load(source.clips(None)[2], 0)

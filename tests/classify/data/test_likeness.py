@@ -19,6 +19,7 @@ from dpcli.classify.data.likeness import (
     tell_rate,
     tell_rounded,
     tell_unlike,
+    tell_unlike_file,
     tell_values,
 )
 from dpcli.classify.data.videos import check_classes, report_gaps, select_videos
@@ -99,6 +100,31 @@ def test_seconds_without_a_frame_are_told(steps, told, capsys, tmp_path):
     report_gaps(CloudsReader(tmp_path / "c.h5"), [0, 1])
     err = " ".join(capsys.readouterr().err.split())
     assert told in err and bool(told) == bool(err)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "told"),
+    [
+        ((1, 1, 1.5, 0.7, 3, 1), ""),  # people, and one who lies down
+        ((1, 1, 1000, 1, 1, 1000), "2 of 6 videos looked at are over 10 times as large or small as the median one"),
+        ((1000, 1000, 1, 1000, 1000), "1 of 5 videos looked at is"),  # meters among millimeters
+        ((1, 0, 1, 1), ""),  # all points in one place say nothing of a unit
+    ],
+)
+def test_videos_in_another_unit_than_most_of_their_file_are_told(sizes, told, capsys, tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a", "b"]) as writer:
+        for number, size in enumerate(sizes):
+            frames = [frame * np.float32(size) for frame in body()]
+            writer.write(CloudSequence.from_frames(f"v{number}", frames, label=number % 2, split="train"))
+    reader, everything = CloudsReader(tmp_path / "c.h5"), range(len(sizes))
+    extent = file_like(reader, everything)["extent"]
+    for normalize, wanted in (("center", told), ("height", "")):
+        info = ModelInfo(
+            KinetConfig(normalize=normalize, points_per_frame=64), ["a", "b"], notes={NOTE: {"extent": extent}}
+        )
+        tell_unlike_file(reader, everything, info, "m")
+        err = " ".join(capsys.readouterr().err.split())
+        assert wanted in err and bool(wanted) == bool(err)
 
 
 def test_a_label_that_the_model_has_no_class_for_is_refused_before_the_work(tmp_path):

@@ -19,6 +19,7 @@ from torch import nn
 
 from dpcli.classify.commands.explain_pac import chosen_samples
 from dpcli.classify.data.clips import ClipSource, normalize
+from dpcli.classify.data.likeness import NOTE, file_like
 from dpcli.classify.explain.features import ClipVectors, Layer, stage_layer
 from dpcli.classify.explain.point_activation_cloud import (
     Question,
@@ -644,3 +645,26 @@ def test_mistakes_end_with_a_sentence_and_no_file(data, weights, tmp_path, capsy
     out = tmp_path / "out.h5"
     assert dpc("classify", "explain", words[0], data, "--model", weights, "-o", out, *words[1:]) == code
     assert sentence in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [("pac", "--samples", "1"), ("tsne", "--clips-per-video", "1")])
+@pytest.mark.parametrize("size, told", [(1.0, False), (1000.0, True)])
+def test_videos_unlike_those_of_the_training_are_told(data, model, tmp_path, capsys, words, size, told):
+    extent = file_like(CloudsReader(data), range(6))["extent"]
+    known = {"extent": extent / size, "points": 40.0, "frames": 5.0}
+    save_model(tmp_path / "m.safetensors", model, ModelInfo(model.config, NAMES, "clips", {NOTE: known}))
+    assert (
+        dpc(
+            "classify",
+            "explain",
+            words[0],
+            data,
+            "--model",
+            tmp_path / "m.safetensors",
+            "-o",
+            tmp_path / "o.h5",
+            *words[1:],
+        )
+        == 0
+    )
+    assert ("is the unit of length another one" in capsys.readouterr().err) is told
