@@ -15,7 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
-from dpcli.prepare.array_files.mat5 import read_variables
+from dpcli.prepare.array_files.mat5 import joined, read_variables
 from dpcli.prepare.array_files.netcdf_packing import unpacked
 from dpcli.prepare.array_files.safe_pickle import load_arrays
 
@@ -27,6 +27,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MOST = 10_000  # data sets of a file that are looked at
 _FEW = 1 << 20  # elements of a list of arrays
 _ROWS_OF_CAMERA = 4  # of the largest arrays that tell of a camera, and of no points
+_OBJECT = "MATLAB_object_decode"  # the attribute of what MATLAB keeps elsewhere in the file: tables, dates, texts
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
 _names: dict[tuple[Path, int, int], ByName[str]] = {}  # arrays in the HDF5 file opened last, and where they lie
 Content = TypeVar("Content")
@@ -46,7 +47,7 @@ class ByName(dict[str, Content]):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.fitting: dict[re.Pattern[str], dict[str, list[str]]] = {}
-        self.cells: dict[str, list[np.ndarray]] = {}
+        self.cells: dict[str, np.ndarray | list[np.ndarray]] = {}
 
 
 class Reversed:
@@ -228,7 +229,8 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
     names: list[str] = []
     if is_hdf5(path):
         with reading(path), h5py.File(path, "r") as file:
-            names = [name for name, item in _datasets(file, path) if not _is_bare_dimension(item)]
+            kinds = {name: item for name, item in _datasets(file, path) if not _is_bare_dimension(item)}
+            names = [name if _OBJECT not in item.attrs else _of_object(name, item) for name, item in kinds.items()]
             links: list[tuple[str, Any]] = []
             file.visititems_links(lambda name, link: links.append((name, link)))
             names += [f"{name} (in {link.filename})" for name, link in links if isinstance(link, h5py.ExternalLink)]
@@ -236,6 +238,11 @@ def others_inside(path: Path, arrays: Mapping[str, Any]) -> list[str]:
         with reading(path), open_archive(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
     return [name for name in names if name not in arrays]
+
+
+def _of_object(name: str, item: h5py.Dataset) -> str:
+    kind = np.bytes_(item.attrs.get("MATLAB_class", b"object")).decode("latin-1")
+    return f"{name} (a {kind} of MATLAB; save its columns as arrays of numbers)"
 
 
 @contextmanager
@@ -264,7 +271,9 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             found = {name: array for name, array in shown.items() if array is not None}
             _names.clear()  # of the file before
             _names[state] = ByName({name: items[name].name for name in found})
-            _names[state].cells = {name: array for name, array in found.items() if isinstance(array, list)}
+            _names[state].cells = {
+                name: array for name, array in found.items() if isinstance(array, (list, np.ndarray))
+            }
         else:
             found = {}
         names = _names[state]
@@ -305,8 +314,8 @@ def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.n
 
     if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
         refuse_claim(item, path)
-        return _cells(file, item, path) or None
-    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item) or _is_text(item):
+        return _cells(file, item, path)
+    if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item) or _is_no_array(item):
         return None
     try:
         refuse_claim(item, path)
@@ -328,9 +337,11 @@ def _require_type(item: h5py.Dataset, path: Path) -> None:
         ) from None
 
 
-def _is_text(item: h5py.Dataset) -> bool:
-    """Returns whether the numbers of a data set are the letters of one of MATLAB's texts."""
-    return item.attrs.get("MATLAB_class") == b"char"
+def _is_no_array(item: h5py.Dataset) -> bool:
+    """Returns whether the numbers of a data set are the letters of one of MATLAB's texts, or places of the contents of an object,
+    such as a table.
+    """
+    return item.attrs.get("MATLAB_class") == b"char" or _OBJECT in item.attrs
 
 
 def _is_bare_dimension(item: h5py.Dataset) -> bool:
@@ -386,20 +397,23 @@ def _name_in_octave(name: str) -> str:
     return "/".join(parts[::2]) if len(parts) % 2 == 0 and set(parts[1::2]) == {"value"} else ""
 
 
-def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> list[np.ndarray] | None:
-    """Returns the arrays of a MATLAB cell, column after column; None where it holds something else."""
+def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> np.ndarray | list[np.ndarray] | None:
+    """Returns the arrays of a MATLAB cell, or of one field of several structs, column after column; None where these hold
+    something else.
+    """
     import h5py
 
     from dpcli.store.file import refuse_claim
 
-    if item.attrs.get("MATLAB_class") != b"cell":
+    of_structs = "MATLAB_class" not in item.attrs and item.parent.attrs.get("MATLAB_class") == b"struct"
+    if item.attrs.get("MATLAB_class") != b"cell" and not of_structs:
         return None
     inside = [file[reference] for reference in item[()].reshape(-1)]
-    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_text(one) for one in inside):
+    if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_no_array(one) for one in inside):
         return None
     for one in inside:
         refuse_claim(one, path)
-    return [np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else one[()].T for one in inside]
+    return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else one[()].T for one in inside])
 
 
 @lru_cache(maxsize=1)  # an array holds many sequences; each process reads it once

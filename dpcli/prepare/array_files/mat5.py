@@ -130,16 +130,22 @@ def _matrix(content: Bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarr
         parts = [part for kind, part in _elements(rest, order) if kind == _MATRIX]
         inside = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in parts]
         plain = [one for one in inside if isinstance(one, np.ndarray)]
-        return name, plain if plain and len(plain) == len(inside) else None
+        return name, joined(plain) if plain and len(plain) == len(inside) else None
     dtype = _type_of(flags, order)
     return name, None if dtype is None else _numbers(rest, dtype, shape, name, order)
 
 
-def _fields(content: Bytes, order: str) -> dict[str, np.ndarray | list[np.ndarray]]:
+def joined(parts: list[np.ndarray]) -> np.ndarray | list[np.ndarray]:
+    """Returns the contents of a cell, or of one field of several structs: an array where each is one number, such as a time."""
+    return np.concatenate(parts, axis=None) if len(parts) > 1 and all(one.size == 1 for one in parts) else parts
+
+
+def _fields(content: Bytes, order: str, above: str = "") -> dict[str, np.ndarray | list[np.ndarray]]:
     """Returns what `_matrix` does of each field of a struct, by ``struct/field``, a list of an array of several structs; {} of
-    anything else. Structs in structs are passed over.
+    anything else. Of structs in structs only those are read that are single. above: of the name, where it lies in another.
     """
     flags, _, name, used = _head(content, order)
+    name = above or name
     if flags & 0xFF != _STRUCT:
         return {}
     parts = [part for _, part in _elements(memoryview(content)[used:], order)]
@@ -150,11 +156,13 @@ def _fields(content: Bytes, order: str) -> dict[str, np.ndarray | list[np.ndarra
     words = [bytes(names[at : at + size]).split(b"\0")[0].decode("latin1") for at in range(0, len(names), size)]
     found: dict[str, np.ndarray | list[np.ndarray]] = {}
     for place, word in enumerate(words):
-        own = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in values[place :: len(words)]]
-        if len(own) == 1 and own[0] is not None:
-            found[f"{name}/{word}"] = own[0]
-        elif len(own) > 1 and all(isinstance(one, np.ndarray) for one in own):
-            found[f"{name}/{word}"] = own
+        fields = values[place :: len(words)]
+        own = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in fields]
+        arrays = [one for one in own if isinstance(one, np.ndarray)]
+        if len(own) == 1:
+            found |= {f"{name}/{word}": own[0]} if own[0] is not None else _fields(fields[0], order, f"{name}/{word}")
+        elif len(own) == len(arrays):
+            found[f"{name}/{word}"] = joined(arrays)
     return found
 
 

@@ -179,6 +179,28 @@ def test_texts_of_matlab_are_no_numbers(tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(frames_of(tmp_path / "a.mat"), expected, strict=True))
 
 
+def test_structs_of_matlab_are_frames_with_their_times(tmp_path):
+    """As version 7.3 has several: each field holds references. What MATLAB keeps as an object is named, and is no array."""
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        columns = {
+            "points": [cloud.T[:, : 40 - t] for t, cloud in enumerate(clouds())],
+            "time": np.arange(6) * 0.25 + 3,
+        }
+        for name, values in columns.items():
+            for t, value in enumerate(values):
+                file[f"#refs#/{name}{t}"] = np.atleast_2d(value)
+            file[f"rec/{name}"] = np.array([[file[f"#refs#/{name}{t}"].ref] for t in range(6)], h5py.ref_dtype)
+        file["rec"].attrs["MATLAB_class"] = np.bytes_("struct")
+        file["T"] = np.zeros((6, 1), np.uint32)
+        file["T"].attrs["MATLAB_class"], file["T"].attrs["MATLAB_object_decode"] = np.bytes_("table"), 3
+    reader = ArraySequences(tmp_path / "a.mat")
+    (item,) = reader.items()
+    assert "not read: T (a table of MATLAB" in reader.summary([item])[0]
+    assert np.allclose(reader.read(item, np.random.default_rng(0)).sequence.time, np.arange(6) * 0.25)
+    expected = [cloud[: 40 - t] for t, cloud in enumerate(clouds())]
+    assert all(np.array_equal(a, b) for a, b in zip(frames_of(tmp_path / "a.mat"), expected, strict=True))
+
+
 def test_what_lies_in_another_file_is_named_and_not_followed(tmp_path):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["points"] = clouds()

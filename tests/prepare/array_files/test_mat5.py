@@ -34,7 +34,7 @@ def test_arrays_are_read_as_scipy_reads_them(tmp_path, kind, compressed):
 
 @pytest.mark.parametrize("compressed", [True, False])
 def test_fields_of_structs_are_read_as_matlab_7_3_has_them(tmp_path, compressed):
-    """A struct, an array of structs whose fields become lists, and what is passed over: texts, structs in structs."""
+    """A struct, one in it, an array of structs whose fields become lists, or arrays of single numbers; texts are passed over."""
     frames = [RNG.normal(size=(count, 3)) for count in (4, 9, 1)]
     structs = np.array(
         [(frame, t / 10, "x") for t, frame in enumerate(frames)], [(n, object) for n in ("xyz", "t", "who")]
@@ -44,18 +44,21 @@ def test_fields_of_structs_are_read_as_matlab_7_3_has_them(tmp_path, compressed)
     one = {
         "points": RNG.normal(size=(2, 5, 3)),
         "name": "walk",
-        "deep": {"a": 1.0},
+        "deep": {"deeper": {"a": 1.0, "b": cell}},
         "cell": cell,
         "a_rather_long_name": 7,
     }
     savemat(tmp_path / "a.mat", {"one": one, "many": structs, "none": {}, "plain": [1, 2]}, do_compression=compressed)
     found = read_variables(tmp_path / "a.mat")
-    assert set(found) == {"one/points", "one/cell", "one/a_rather_long_name", "many/xyz", "many/t", "plain"}
+    deep = {"one/deep/deeper/a", "one/deep/deeper/b"}
+    assert set(found) == {"one/points", "one/cell", "one/a_rather_long_name", "many/xyz", "many/t", "plain", *deep}
     assert np.array_equal(found["one/points"], one["points"]) and found["one/a_rather_long_name"] == 7
     assert all(
-        np.array_equal(a, b) for name in ("one/cell", "many/xyz") for a, b in zip(found[name], frames, strict=True)
+        np.array_equal(a, b)
+        for name in ("one/cell", "many/xyz", "one/deep/deeper/b")
+        for a, b in zip(found[name], frames, strict=True)
     )
-    assert np.allclose(np.ravel(found["many/t"]), [0, 0.1, 0.2])
+    assert isinstance(found["many/t"], np.ndarray) and np.allclose(found["many/t"], [0, 0.1, 0.2])
 
 
 def test_damaged_structs_end_with_a_sentence(tmp_path):
