@@ -23,6 +23,7 @@ from dpcli.prepare.cloud_formats.column_names import (
     find_colors,
     find_frame_column,
     find_trios,
+    first_unit,
     note_of_units,
     unit_of_attributes,
 )
@@ -176,6 +177,6 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
             if columns and _are_points(columns):
                 told = {name: told_units(one) for name, one in alike.items()}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}
-                told[""] = told_beside(arrays, f"{group}/{next(iter(alike))}".lstrip("/"))
+                told[""] = first_unit(told_beside(arrays, f"{group}/{next(iter(alike))}".lstrip("/")))
                 found[group] = (columns, {name: units for name, units in told.items() if units})
     return found

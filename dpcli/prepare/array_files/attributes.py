@@ -1,4 +1,4 @@
-"""What HDF5's attributes, and texts beside arrays, say of these: their units, their times."""
+"""Attributes of HDF5, and texts beside arrays, that tell their units and times."""
 
 from __future__ import annotations
 
@@ -8,26 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.prepare.cloud_formats.column_names import unit_of_comments
-
 UNIT_NAMES = ("units", "unit", "length_unit")
 _LETTERS = 100  # of a text that tells a unit
 
 
-def told_length(arrays: Mapping[str, Any], name: str) -> str:
-    """Returns what is said of the unit of an array, by its own attribute or else beside it; "" where nothing is."""
-    return told_units(arrays[name]) or told_beside(arrays, name)
-
-
-def told_beside(arrays: Mapping[str, Any], name: str) -> str:
-    """Returns the length that an attribute of the group of an array says, or of one above, or a text beside, as in
-    ``savez(file, points=points, units="mm")``; "" where none is known.
+def told_lengths(arrays: Mapping[str, Any], name: str) -> list[str]:
+    """Returns what its own attribute says of the unit of an array, or else what attributes of its group, and of those above, and
+    texts beside it say, as in ``savez(file, points=points, units="mm")``: the nearest first. These may tell of other things.
     """
-    group, texts, found = name, getattr(arrays, "texts", {}), ""
-    while group and not found:
+    own = told_units(arrays[name])
+    return [own] if own else told_beside(arrays, name)
+
+
+def told_beside(arrays: Mapping[str, Any], name: str) -> list[str]:
+    """Returns what `told_lengths` does of an array without an attribute of its own."""
+    group, texts, found = name, getattr(arrays, "texts", {}), []
+    while group:
         group = group.rpartition("/")[0]
-        told = [texts.get(f"{group}/{called}".lstrip("/"), "") for called in UNIT_NAMES]
-        found = next((text for text in told if unit_of_comments([f"units: {text}"])), "")
+        found += [texts.get(f"{group}/{called}".lstrip("/"), "") for called in UNIT_NAMES]
     return found
 
 

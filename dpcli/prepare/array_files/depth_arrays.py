@@ -11,11 +11,10 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.array_files.attributes import attributes_of, told_length, told_units
+from dpcli.prepare.array_files.attributes import attributes_of, told_lengths, told_units
 from dpcli.prepare.array_files.axes import MATRICES, are_poses
 from dpcli.prepare.array_files.containers import Unreadable, open_arrays
 from dpcli.prepare.array_files.netcdf_packing import PACKING, Unpacked
-from dpcli.prepare.cloud_formats.column_names import unit_of_comments
 
 # names that say depth, and not a picture of it or what lies beside it
 DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
@@ -71,7 +70,7 @@ def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
 class ArchivedDepth:
     """Holds the depth of a file of named arrays, and what lies beside it. small: arrays that may tell of the camera or of times, by
     name, of which ``units`` has what their attributes say; large: the names of other arrays; attributes: those of HDF5's depth;
-    unit: its unit, as in `store.schema.METERS`, or "".
+    lengths: what may tell its unit, the nearest first.
     """
 
     depth: np.ndarray
@@ -79,7 +78,7 @@ class ArchivedDepth:
     units: dict[str, str]
     large: tuple[str, ...]
     attributes: dict[str, np.ndarray]
-    unit: str
+    lengths: list[str]
 
 
 def archived_depth(path: Path) -> ArchivedDepth:
@@ -103,7 +102,7 @@ def archived_depth(path: Path) -> ArchivedDepth:
             units,
             tuple(name for name in others if name not in small),
             _told_by_attributes(arrays[chosen]),
-            unit_of_comments([f"units: {told_length(opened, chosen)}"]),
+            told_lengths(opened, chosen),
         )
 
 

@@ -1,4 +1,4 @@
-"""Units that attributes and texts beside arrays tell."""
+"""Tests of units that attributes and texts beside arrays tell."""
 
 import h5py
 import numpy as np
