@@ -23,9 +23,12 @@ def told_lengths(arrays: Mapping[str, Any], name: str) -> list[str]:
 def told_beside(arrays: Mapping[str, Any], name: str) -> list[str]:
     """Returns what `told_lengths` does of an array without an attribute of its own."""
     group, texts, found = name, getattr(arrays, "texts", {}), []
+    holder: Any = getattr(arrays[name], "_dataset", arrays[name])
     while group:
-        group = group.rpartition("/")[0]
-        found += [texts.get(f"{group}/{called}".lstrip("/"), "") for called in UNIT_NAMES]
+        group, holder = group.rpartition("/")[0], getattr(holder, "parent", None)
+        told = {} if holder is None else _read_attributes(holder)
+        found += [_text_of(told[called]) for called in UNIT_NAMES if called in told]
+        found += [texts[own] for called in UNIT_NAMES if (own := f"{group}/{called}".lstrip("/")) in texts]
     return found
 
 
@@ -68,17 +71,8 @@ def _read_attributes(*holders: Any) -> dict[str, Any]:
 
 
 def texts_about(items: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the texts that data sets of HDF5 hold whose names say that they tell a unit, and such attributes of the groups of
-    all, by name.
-    """
-    found = {name: _text_of(item) for name, item in items.items() if says_unit(name)}
-    for group in {group for item in items.values() for group in (item.parent, item.parent.parent)}:
-        for name in UNIT_NAMES:
-            with suppress(TypeError, ValueError, OSError):  # of a type that h5py can't read
-                found |= (
-                    {f"{group.name}/{name}".lstrip("/"): _text_of(group.attrs[name])} if name in group.attrs else {}
-                )
-    return found
+    """Returns the texts that data sets of HDF5 hold whose names say that they tell a unit, by name."""
+    return {name: _text_of(item) for name, item in items.items() if says_unit(name)}
 
 
 def _text_of(told: Any) -> str:
