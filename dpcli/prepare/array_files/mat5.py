@@ -179,6 +179,10 @@ def _fields(content: Bytes, order: str, name: str) -> dict[str, np.ndarray | lis
         if len(fields) == 1 and len(fields[0]):
             found |= _of_variable(fields[0], order, f"{name}/{word}")
             continue
+        texts = {_text(part, order) for part in fields if len(part)} if says_unit(word) else set()
+        if len(texts) == 1 and "" not in texts:
+            found[f"{name}/{word}"] = np.array(texts.pop())
+            continue
         own = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in fields]
         arrays = [one for one in own if isinstance(one, np.ndarray)]
         if len(own) == len(arrays):

@@ -20,6 +20,9 @@ def write(path, form: str) -> None:
         savemat(path, data)
     elif form == "struct":
         savemat(path, {"rec": data}, do_compression=True)
+    elif form == "structs":
+        frames = [(cloud[t:] * 1000, "mm") for t, cloud in enumerate(POINTS)]
+        savemat(path, {"rec": np.array(frames, [("points", object), ("units", object)])})
     elif form == "mat 7.3":
         with h5py.File(path, "w", userblock_size=512) as file:
             file["points"], file["units"] = data["points"].T, np.array([[ord(letter)] for letter in "mm"], np.uint16)
@@ -47,7 +50,8 @@ def write(path, form: str) -> None:
 @pytest.mark.parametrize(
     ("form", "suffix"),
     [
-        *(("npz", ".npz"), ("mat", ".mat"), ("struct", ".mat"), ("mat 7.3", ".mat"), ("text", ".h5"), ("root", ".h5")),
+        *(("npz", ".npz"), ("mat", ".mat"), ("struct", ".mat"), ("structs", ".mat"), ("mat 7.3", ".mat")),
+        *(("text", ".h5"), ("root", ".h5")),
         *(("group", ".h5"), ("above", ".h5"), ("array", ".h5"), ("columns", ".h5"), ("columns of a group", ".h5")),
     ],
 )
@@ -58,7 +62,8 @@ def test_a_unit_beside_the_points_counts(tmp_path, form, suffix):
     assert not run.returncode and "converted from mm to m" in run.stderr, run.stderr
     assert "units" not in run.stderr
     with CloudsReader(tmp_path / "out.h5") as reader:
-        assert np.allclose(reader.read(0).points, POINTS.reshape(-1, 3), atol=1e-5)
+        frames = [cloud[t if form == "structs" else 0 :] for t, cloud in enumerate(POINTS)]
+        assert np.allclose(reader.read(0).points, np.concatenate(frames), atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".h5"])
