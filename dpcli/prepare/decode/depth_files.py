@@ -409,7 +409,7 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
     """Returns what the arrays beside those of so many frames of depth tell, and the attributes of these, by the fields of a
     `DepthVideo`.
     """
-    from dpcli.prepare.decode.calibration import camera_of_arrays
+    from dpcli.prepare.decode.calibration import camera_of_any
     from dpcli.prepare.times_beside import seconds_beside
 
     attributes, whole, unit = found.attributes, found.depth.dtype.kind != "f", first_unit(found.lengths)
@@ -417,11 +417,9 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
     clocks = [name for name, one in found.small.items() if says_times(name.rpartition("/")[2]) and one.size == frames]
     times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
     name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
-    try:
-        camera, scale, rest = camera_of_arrays(path, {**attributes, **own, **found.small})
-    except DataError:
-        camera, scale, rest = camera_of_arrays(path, {**own, **found.small})
-        rest += tuple(f"attribute {one}" for one in attributes)
+    further = ({**attributes, **own}, attributes, own, {})  # a unit may be that of numbers once they are scaled
+    (camera, scale, rest), used = camera_of_any(path, further, found.small)
+    rest += tuple(f"attribute {one}" for one in attributes if one not in used)
     scale = scale if whole else 1 / METERS[unit] if unit not in ("", "m") else None  # fractions are lengths
     unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
     notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}

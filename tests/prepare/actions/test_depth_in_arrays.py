@@ -88,6 +88,12 @@ def test_the_unit_of_depth_counts(tmp_path, unit, scale):
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
     found, _ = read(write(tmp_path / "c.npz", {"depth": DEPTH, "units": unit}))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+    for place in ("e.npz", "e.h5"):  # which may be that of what a scale makes of the numbers
+        data = {"depth": DEPTH, "depth_scale": 0.0005, "units": unit}
+        found, _ = read(write(tmp_path / place, data))
+        assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 2000)
+    found, _ = read(write(tmp_path / "f.h5", {"depth": DEPTH}, depth_scale=0.0005, units=unit))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 2000)
     found, _ = read(write(tmp_path / "d.h5", {"depth": np.float32(DEPTH / 500)}, units=unit if unit == "cm" else "m"))
     assert np.allclose(found.points[0, 2], np.float32(DEPTH[0, 0, 0] / 500) / (100 if unit == "cm" else 1))
     found, notes = read(write(tmp_path / "b.h5", {"depth": DEPTH}, units=unit, fx=500.0))
