@@ -13,8 +13,9 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.attributes import told_beside, told_units
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
-from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables, told_units
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.column_names import (
     axes_in,
@@ -22,6 +23,7 @@ from dpcli.prepare.cloud_formats.column_names import (
     find_colors,
     find_frame_column,
     find_trios,
+    first_unit,
     note_of_units,
     unit_of_attributes,
 )
@@ -175,5 +177,6 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
             if columns and _are_points(columns):
                 told = {name: told_units(one) for name, one in alike.items()}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}
+                told[""] = first_unit(told_beside(arrays, f"{group}/{next(iter(alike))}".lstrip("/")))
                 found[group] = (columns, {name: units for name, units in told.items() if units})
     return found

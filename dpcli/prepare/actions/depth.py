@@ -234,6 +234,7 @@ class DepthVideos:
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
         read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
+        scale = None if read.frames[0].dtype.kind == "f" else scale  # these are meters
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
@@ -264,7 +265,7 @@ class DepthVideos:
         kind = video.frames.dtype
         if self.calibration and not self.depth_scale and kind.kind != "f":
             self.calibration.require_clear_scale()
-        told = self._declared_scale or (video.scale if kind.kind != "f" else None)
+        told = self._declared_scale or video.scale
         return told or usual_scale(kind), told is not None
 
     def _inverted(self, frames: np.ndarray, path: Path) -> np.ndarray:

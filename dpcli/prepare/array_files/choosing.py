@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.prepare.array_files.attributes import attributes_of
 from dpcli.prepare.array_files.axes import are_poses, coordinates_axis
-from dpcli.prepare.array_files.containers import attributes_of
 from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_names
 

@@ -6,7 +6,7 @@ import io
 import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
+from dpcli.prepare.array_files.attributes import says_unit, texts_about
 from dpcli.prepare.array_files.mat5 import joined, read_variables
 from dpcli.prepare.array_files.netcdf_packing import unpacked
 from dpcli.prepare.array_files.safe_pickle import load_arrays
@@ -40,14 +41,15 @@ class _NoNumbersError(DataError):
 
 class ByName(dict[str, Content]):
     """Holds something for each array of a file by name, and what was found out about them: by the pattern that they fit, the names
-    of each group, and the lists that cells of MATLAB are. A file may hold thousands of sequences, and its names are searched and
-    its cells read once, not for each of them.
+    of each group, the lists that cells of MATLAB are, and texts that tell units (`attributes.told_length`). A file may hold
+    thousands of sequences, and its names are searched and its cells read once, not for each of them.
     """
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.fitting: dict[re.Pattern[str], dict[str, list[str]]] = {}
         self.cells: dict[str, np.ndarray | list[np.ndarray]] = {}
+        self.texts: dict[str, str] = {}
 
 
 class Reversed:
@@ -78,35 +80,6 @@ class Unreadable:
 
     def __getitem__(self, key: Any) -> np.ndarray:
         raise self._error
-
-
-def told_units(array: Any) -> str:
-    """Returns what the attribute ``units`` or ``unit`` of an HDF5 data set says, such as "mm" or "hours since 2024-03-05"; ""
-    without one.
-    """
-    attributes = getattr(array, "attrs", {})
-    told = np.ravel(attributes.get("units", attributes.get("unit", ""))).tolist()
-    return " ".join(one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in told)
-
-
-def attributes_of(array: Any, *, above: bool = False) -> Mapping[str, Any]:
-    """Returns the attributes of an HDF5 data set, and of its group where it has none of a name; none of other arrays. above: only
-    those of the group that holds its group.
-    """
-    dataset = getattr(array, "_dataset", array)
-    if not hasattr(dataset, "parent"):
-        return {}
-    return _read_attributes(dataset.parent.parent if above else dataset.parent, *([] if above else [dataset]))
-
-
-def _read_attributes(*holders: Any) -> dict[str, Any]:
-    """Returns the attributes of groups and data sets, those of the last first; without those whose type h5py can't read."""
-    found = {}
-    for holder in holders:
-        for name in holder.attrs:
-            with suppress(TypeError, ValueError, OSError):
-                found[name] = holder.attrs[name]
-    return found
 
 
 Array = Any  # np.ndarray, h5py.Dataset, Reversed, Unpacked or Unreadable: shape, dtype, ndim, and slices of it by []
@@ -274,6 +247,7 @@ def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
             _names[state].cells = {
                 name: array for name, array in found.items() if isinstance(array, (list, np.ndarray))
             }
+            _names[state].texts = texts_about(items)
         else:
             found = {}
         names = _names[state]
@@ -287,7 +261,7 @@ class _Opened(Mapping[str, Any]):
 
     def __init__(self, names: ByName[str], show: Callable[[str], Any], found: dict[str, Any]) -> None:
         self._names, self._show, self._found = names, show, found
-        self.fitting = names.fitting
+        self.fitting, self.texts = names.fitting, names.texts
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._found:
@@ -421,7 +395,7 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
     if path.suffix.lower() == ".npy":
         return {"": _npy(path)}
     if path.suffix.lower() == ".mat":
-        return ByName(read_variables(path))
+        return _apart(read_variables(path))
     if path.suffix.lower() in (".h5", ".hdf5"):
         raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated")
     with reading(path), open_archive(path) as archive:
@@ -435,11 +409,21 @@ def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | lis
             except _NoNumbersError as error:
                 foreign = foreign or error
                 continue
-            if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names:
-                arrays[one.filename[: -len(".npy")]] = array
+            name = one.filename[: -len(".npy")]
+            told = not isinstance(array, list) and array.dtype.kind == "U" and array.size == 1 and says_unit(name)
+            if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names or told:
+                arrays[name] = array
     if foreign and not any(isinstance(one, list) or one.ndim and len(one) > _ROWS_OF_CAMERA for one in arrays.values()):
         raise foreign
-    return ByName(arrays)
+    return _apart(arrays)
+
+
+def _apart(found: dict[str, np.ndarray | list[np.ndarray]]) -> ByName[np.ndarray | list[np.ndarray]]:
+    """Returns arrays with the texts among them, which tell units, apart."""
+    texts = {name: one.item() for name, one in found.items() if not isinstance(one, list) and one.dtype.kind == "U"}
+    arrays = ByName({name: one for name, one in found.items() if name not in texts})
+    arrays.texts = texts
+    return arrays
 
 
 def _npy(path: Path) -> np.ndarray | list[np.ndarray]:

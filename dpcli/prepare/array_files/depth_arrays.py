@@ -11,8 +11,9 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.attributes import attributes_of, told_lengths, told_units
 from dpcli.prepare.array_files.axes import MATRICES, are_poses
-from dpcli.prepare.array_files.containers import Unreadable, attributes_of, open_arrays, told_units
+from dpcli.prepare.array_files.containers import Unreadable, open_arrays
 from dpcli.prepare.array_files.netcdf_packing import PACKING, Unpacked
 
 # names that say depth, and not a picture of it or what lies beside it
@@ -68,7 +69,8 @@ def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
 @dataclass(frozen=True)
 class ArchivedDepth:
     """Holds the depth of a file of named arrays, and what lies beside it. small: arrays that may tell of the camera or of times, by
-    name, of which ``units`` has what their attributes say; large: the names of other arrays; attributes: those of HDF5's depth.
+    name, of which ``units`` has what their attributes say; large: the names of other arrays; attributes: those of HDF5's depth;
+    lengths: what may tell its unit, the nearest first.
     """
 
     depth: np.ndarray
@@ -76,6 +78,7 @@ class ArchivedDepth:
     units: dict[str, str]
     large: tuple[str, ...]
     attributes: dict[str, np.ndarray]
+    lengths: list[str]
 
 
 def archived_depth(path: Path) -> ArchivedDepth:
@@ -99,6 +102,7 @@ def archived_depth(path: Path) -> ArchivedDepth:
             units,
             tuple(name for name in others if name not in small),
             _told_by_attributes(arrays[chosen]),
+            told_lengths(opened, chosen),
         )
 
 
@@ -114,10 +118,9 @@ def _marked(array: Any) -> np.ndarray:
 
 
 def _told_by_attributes(array: Any) -> dict[str, np.ndarray]:
-    """Returns the numbers among the attributes of HDF5's depth and of its group, and the text that tells its units."""
+    """Returns the numbers among the attributes of HDF5's depth and of its group."""
     found = {name: np.asarray(one) for name, one in attributes_of(array).items() if name not in PACKING}
-    found = {name: one for name, one in found.items() if one.dtype.kind in "uif" and one.size}
-    return found | ({"units": np.array(told_units(array))} if told_units(array) else {})
+    return {name: one for name, one in found.items() if one.dtype.kind in "uif" and one.size}
 
 
 def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:

@@ -15,12 +15,13 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import PACKED_AT_MOST, ROOM
+from dpcli.prepare.array_files.attributes import says_unit
 
 _HEADER = 128
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # as stored
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}  # as meant
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT = 1, 2  # of the classes
+_CELL, _STRUCT, _CHAR = 1, 2, 4  # of the classes
 _COMPLEX = 8  # flag
 _BEGIN = 4096  # bytes of a compressed array in which its name and shape are
 _MOST = 1 << 31  # bytes of one array
@@ -99,7 +100,8 @@ def _variable(path: Path, kind: int, content: Bytes, order: str, wanted: str) ->
 
 def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
     """Returns all variables that are arrays of real numbers, or cells of such arrays (as lists, column after column), by
-    name, and such fields of structs as ``struct/field``, as MATLAB 7.3 has them; others are passed over.
+    name, and such fields of structs as ``struct/field``, as MATLAB 7.3 has them, and texts that tell units (each an array of one);
+    others are passed over.
 
     Raises DataError as `read_mat5`, and where a file unpacks to far more than it has.
     """
@@ -115,11 +117,29 @@ def read_variables(path: Path) -> dict[str, np.ndarray | list[np.ndarray]]:
                     raise _Damaged(f"its variables claim more than {ROOM + PACKED_AT_MOST * len(data)} bytes")
                 kind, content = next(_elements(memoryview(content), order), (0, b""))
             if kind == _MATRIX:
-                name, values = _matrix(content, order)
-                found |= {name: values} if values is not None else _fields(content, order)
+                found |= _of_variable(content, order)
     except (_Damaged, zlib.error) as error:
         raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
     return found
+
+
+def _of_variable(content: Bytes, order: str, above: str = "") -> dict[str, np.ndarray | list[np.ndarray]]:
+    """Returns what `read_variables` does of one variable, or of the field of a struct, whose whole name is ``above``."""
+    name, values = _matrix(content, order)
+    name = above or name
+    if values is None and says_unit(name) and (text := _text(content, order)):
+        values = np.array(text)
+    return {name: values} if values is not None else _fields(content, order, name)
+
+
+def _text(content: Bytes, order: str) -> str:
+    """Returns the letters of a matrix of them, "" of any other."""
+    flags, _, _, used = _head(content, order)
+    if flags & 0xFF != _CHAR:
+        return ""
+    stored, raw = next(_elements(memoryview(content)[used:], order), (0, b""))
+    wide = "utf-16-le" if order == "<" else "utf-16-be"
+    return bytes(raw).decode(wide if stored in (4, 17) else "utf-8", "replace")
 
 
 def _matrix(content: Bytes, order: str) -> tuple[str, np.ndarray | list[np.ndarray] | None]:
@@ -140,12 +160,11 @@ def joined(parts: list[np.ndarray]) -> np.ndarray | list[np.ndarray]:
     return np.concatenate(parts, axis=None) if len(parts) > 1 and all(one.size == 1 for one in parts) else parts
 
 
-def _fields(content: Bytes, order: str, above: str = "") -> dict[str, np.ndarray | list[np.ndarray]]:
+def _fields(content: Bytes, order: str, name: str) -> dict[str, np.ndarray | list[np.ndarray]]:
     """Returns what `_matrix` does of each field of a struct, by ``struct/field``, a list of an array of several structs; {} of
-    anything else. Of structs in structs only those are read that are single. above: of the name, where it lies in another.
+    anything else. Of structs in structs only those are read that are single. name: the struct's.
     """
-    flags, _, name, used = _head(content, order)
-    name = above or name
+    flags, _, _, used = _head(content, order)
     if flags & 0xFF != _STRUCT:
         return {}
     parts = [part for _, part in _elements(memoryview(content)[used:], order)]
@@ -157,12 +176,17 @@ def _fields(content: Bytes, order: str, above: str = "") -> dict[str, np.ndarray
     found: dict[str, np.ndarray | list[np.ndarray]] = {}
     for place, word in enumerate(words):
         fields = values[place :: len(words)]
+        if len(fields) == 1 and len(fields[0]):
+            found |= _of_variable(fields[0], order, f"{name}/{word}")
+            continue
+        texts = {_text(part, order) for part in fields if len(part)} if says_unit(word) else set()
+        if len(texts) == 1 and "" not in texts:
+            found[f"{name}/{word}"] = np.array(texts.pop())
+            continue
         own = [_matrix(part, order)[1] if len(part) else np.zeros((0, 0)) for part in fields]
         arrays = [one for one in own if isinstance(one, np.ndarray)]
-        if len(own) == 1:
-            found |= {f"{name}/{word}": own[0]} if own[0] is not None else _fields(fields[0], order, f"{name}/{word}")
-        elif len(own) == len(arrays):
-            found[f"{name}/{word}"] = joined(arrays)
+        if len(own) == len(arrays):
+            found[f"{name}/{word}"] = joined(arrays) if len(own) > 1 else arrays[0]
     return found
 
 

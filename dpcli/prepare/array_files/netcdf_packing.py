@@ -67,6 +67,8 @@ class Unpacked:
 
 def unpacked(dataset: Any) -> Any:
     """Returns a data set of numbers as its attributes mean it: itself where they say nothing."""
+    if not {*PACKING, _UNSIGNED} & {*dataset.attrs}:
+        return dataset
     packed = (_number(dataset, "scale_factor", 1), _number(dataset, "add_offset", 0)) != (1, 0)
     stored = _stored_type(dataset)
     marked = any(np.isfinite(mark) for name in _MISSING for mark in _marks(dataset, name, stored))

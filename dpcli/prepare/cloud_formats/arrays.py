@@ -9,7 +9,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
-from dpcli.prepare.array_files.containers import open_arrays, tables_inside, told_units
+from dpcli.prepare.array_files.attributes import says_unit, told_lengths, told_units
+from dpcli.prepare.array_files.containers import open_arrays, tables_inside
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
@@ -20,7 +21,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     unnamed_columns,
     without,
 )
-from dpcli.prepare.cloud_formats.column_names import find_frame_column, note_of_units, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import find_frame_column, first_unit, note_of_units
 from dpcli.prepare.named_columns import ArrayTable, holds_table
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
@@ -47,7 +48,12 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
         cloud = _cloud_of_array(path, arrays[records[0]], keep)
         cloud.unread += without(list(arrays), records)
         return cloud
-    return _cloud_of_arrays(path, arrays, keep)
+    texts = {name: str(one.item()) for name, one in arrays.items() if one.dtype.kind == "U" and one.size == 1}
+    units = {name: first_unit([text]) for name, text in texts.items() if says_unit(name)}
+    told = {name: unit for name, unit in units.items() if unit}
+    cloud = _cloud_of_arrays(path, {name: one for name, one in arrays.items() if name not in told}, keep)
+    cloud.unit = cloud.unit or next(iter(told.values()), "")
+    return cloud
 
 
 def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -65,8 +71,9 @@ def read_mat(path: Path, keep: Sequence[str] = ()) -> Cloud:
         if not plain and tables_inside(path):
             ArrayTable(path)  # says that there are several
         told = {name: told_units(arrays[name]) for name in plain}
+        lengths = {name: first_unit(told_lengths(arrays, name)) for name in plain}
     cloud = _cloud_of_arrays(path, {name: _as_vector(name, one) for name, one in plain.items()}, keep)
-    units = {unit_of_comments([f"units: {told[name]}"]) for name in cloud.columns[:3]} - {""}
+    units = {lengths[name] for name in cloud.columns[:3]} - {""}
     cloud.unit = cloud.unit or (units.pop() if len(units) == 1 else "")
     cloud.dropped |= note_of_units(cloud.columns[:3], told)
     return cloud

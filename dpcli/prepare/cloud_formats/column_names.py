@@ -157,6 +157,15 @@ def _unit_of_match(unit: str, size: str | None = None) -> str:
     return known if number == 1 else _METERS.get(number, "") if known == "m" else ""
 
 
+def first_unit(told: Iterable[str]) -> str:
+    """Returns the first unit that one of some attributes tells, "" where none does.
+
+    >>> first_unit(["", "seconds", "in", "mm"]), first_unit([])
+    ('in', '')
+    """
+    return next((unit for text in told if (unit := unit_of_comments([f"units: {text}"]))), "")
+
+
 def unit_of_attributes(path: Path, names: Iterable[str], told: Mapping[str, str]) -> str:
     """Returns the unit that attributes of some columns tell, else that of their whole table; "" where they tell none.
 

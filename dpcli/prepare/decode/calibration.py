@@ -6,7 +6,8 @@ Whatever a file declares is used, or refused by its name.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,18 @@ def camera_of_arrays(
     scale = camera.depth_scale if camera else _depth_scale(path, told, {})
     about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_LENS, *_MODEL, "width", "height") if camera else ()
     return camera, scale, tuple(k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
+
+
+def camera_of_any(
+    path: Path, further: Sequence[dict[str, np.ndarray]], arrays: dict[str, np.ndarray]
+) -> tuple[tuple[Calibration | None, float | None, tuple[str, ...]], dict[str, np.ndarray]]:
+    """Returns what `camera_of_arrays` does of arrays and the first of some further ones that contradict neither them nor each
+    other, and these. Raises DataError where the last do, too.
+    """
+    for more in further[:-1]:
+        with suppress(DataError):
+            return camera_of_arrays(path, {**more, **arrays}), more
+    return camera_of_arrays(path, {**further[-1], **arrays}), further[-1]
 
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from dpcli.path_names import utf8_path
 from dpcli.prepare.array_files.choosing import says_times
 from dpcli.prepare.array_files.containers import open_arrays
 from dpcli.prepare.array_files.depth_arrays import DEPTH_NAME, ArchivedDepth, archived_depth, depth_frames, says_depth
-from dpcli.prepare.cloud_formats.column_names import unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import first_unit
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pictures import tiff
 from dpcli.prepare.decode.pictures.portable_maps import read_portable_map
@@ -26,6 +26,7 @@ from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, joined_videos, promised_frames
 from dpcli.runtime.clips.cropping import margins
 from dpcli.runtime.clips.other_files import stand_in
+from dpcli.store.schema import METERS
 
 if TYPE_CHECKING:
     from dpcli.prepare.decode.pinhole_camera import Calibration
@@ -408,20 +409,18 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
     """Returns what the arrays beside those of so many frames of depth tell, and the attributes of these, by the fields of a
     `DepthVideo`.
     """
-    from dpcli.prepare.decode.calibration import camera_of_arrays
+    from dpcli.prepare.decode.calibration import camera_of_any
     from dpcli.prepare.times_beside import seconds_beside
 
-    attributes = dict(found.attributes)
-    unit = unit_of_comments([f"units: {attributes.pop('units', '')}"])
-    own = {"depth_unit": np.array(unit)} if unit and found.depth.dtype.kind != "f" else {}
+    attributes, whole, unit = found.attributes, found.depth.dtype.kind != "f", first_unit(found.lengths)
+    own = {"depth_unit": np.array(unit)} if unit and whole else {}
     clocks = [name for name, one in found.small.items() if says_times(name.rpartition("/")[2]) and one.size == frames]
     times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
     name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
-    try:
-        camera, scale, rest = camera_of_arrays(path, {**attributes, **own, **found.small})
-    except DataError:
-        camera, scale, rest = camera_of_arrays(path, {**own, **found.small})
-        rest += tuple(f"attribute {one}" for one in attributes)
+    further = ({**attributes, **own}, attributes, own, {})  # a unit may be that of numbers once they are scaled
+    (camera, scale, rest), used = camera_of_any(path, further, found.small)
+    rest += tuple(f"attribute {one}" for one in attributes if one not in used)
+    scale = scale if whole else 1 / METERS[unit] if unit not in ("", "m") else None  # fractions are lengths
     unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
     notes = {f"videos whose file holds arrays that are not read ({', '.join(unread[:5])})": 1} if unread else {}
     return {"camera": camera, "scale": scale, "notes": notes, "time": time}

@@ -15,6 +15,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
+from dpcli.prepare.array_files.attributes import attributes_of, told_lengths, told_units
 from dpcli.prepare.array_files.axes import axes_of, check_axes, choices, coordinates_axis
 from dpcli.prepare.array_files.choosing import (
     Beside,
@@ -27,18 +28,10 @@ from dpcli.prepare.array_files.choosing import (
     says_label,
     says_times,
 )
-from dpcli.prepare.array_files.containers import (
-    SUFFIXES,
-    attributes_of,
-    made_by_dpc,
-    open_arrays,
-    others_inside,
-    tables_inside,
-    told_units,
-)
+from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, others_inside, tables_inside
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import note_of_units, unit_of_comments
+from dpcli.prepare.cloud_formats.column_names import first_unit, note_of_units
 from dpcli.prepare.decode.folder_listing import files_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
@@ -248,7 +241,7 @@ class ArraySequences(OwnScans):
             time = _times(item.path, arrays, beside, axes, source) if item.extra["time"] and not self.fps else None
             real = _real_points(item.path, arrays, beside, axes, source, frames)
             units = told_units(arrays[source.keys[0]])
-            unit = unit_of_comments([f"units: {units}"])
+            unit = first_unit(told_lengths(arrays, source.keys[0]))
             wanted = _frame_count(item.path, arrays, beside, source, len(frames))
         if item.extra["time"] and time is None:
             if not self.fps:
@@ -328,6 +321,8 @@ class ArraySequences(OwnScans):
                     beside += [name for name in arrays if says_label(name) and name.rpartition("/")[0] in groups]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}
                 unread = [name for name in arrays if name not in used] + others_inside(item.path, arrays)
+                texts = getattr(arrays, "texts", {})
+                unread = [name for name in unread if not first_unit([texts.get(name, "")])]
                 first = arrays[source.keys[0]]
                 shape = tuple(first.shape) if axes else ()
                 shapes = [one.shape for one in first if one.size] if isinstance(first, list) else [first.shape]

@@ -82,10 +82,20 @@ def test_a_camera_and_a_unit_in_single_numbers_of_hdf5_are_used(tmp_path, place)
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1000), ("cm", 100), ("raw", 1000)])
-def test_the_unit_of_depth_in_whole_numbers_counts(tmp_path, unit, scale):
-    """Beside attributes that tell no camera, too, which are named."""
+def test_the_unit_of_depth_counts(tmp_path, unit, scale):
+    """Of whole numbers and others, and beside attributes that tell no camera, which are named."""
     found, _ = read(write(tmp_path / "a.h5", {"depth": DEPTH}, units=unit))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+    found, _ = read(write(tmp_path / "c.npz", {"depth": DEPTH, "units": unit}))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
+    for place in ("e.npz", "e.h5"):  # which may be that of what a scale makes of the numbers
+        data = {"depth": DEPTH, "depth_scale": 0.0005, "units": unit}
+        found, _ = read(write(tmp_path / place, data))
+        assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 2000)
+    found, _ = read(write(tmp_path / "f.h5", {"depth": DEPTH}, depth_scale=0.0005, units=unit))
+    assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / 2000)
+    found, _ = read(write(tmp_path / "d.h5", {"depth": np.float32(DEPTH / 500)}, units=unit if unit == "cm" else "m"))
+    assert np.allclose(found.points[0, 2], np.float32(DEPTH[0, 0, 0] / 500) / (100 if unit == "cm" else 1))
     found, notes = read(write(tmp_path / "b.h5", {"depth": DEPTH}, units=unit, fx=500.0))
     assert np.allclose(found.points[0, 2], DEPTH[0, 0, 0] / scale)
     assert "not read (attribute fx)" in notes
