@@ -41,7 +41,7 @@ class _NoNumbersError(DataError):
 
 class ByName(dict[str, Content]):
     """Holds something for each array of a file by name, and what was found out about them: by the pattern that they fit, the names
-    of each group, the lists that cells of MATLAB are, and texts that tell units (`attributes.told_length`). A file may hold
+    of each group, the lists that cells of MATLAB are, and texts that tell units (`attributes.told_lengths`). A file may hold
     thousands of sequences, and its names are searched and its cells read once, not for each of them.
     """
 
