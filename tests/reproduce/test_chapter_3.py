@@ -423,7 +423,7 @@ def test_a_target_without_its_folder_says_which_variable_to_give(target, variabl
     if not (ROOT / "Makefile").exists() or shutil.which("make") is None:
         pytest.skip("no make here")
     empty = {key: "" for key in FOLDERS}
-    words = ["make", "-n", f"VENV={tmp_path}", target]
+    words = ["make", "--no-print-directory", "-n", f"VENV={tmp_path}", target]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, env={**os.environ, **empty})
     assert done.returncode == 2 and f"make {target} needs {variable}" in done.stderr
     assert done.stdout == "", "the environment is made, for minutes, before the missing folder is told"

@@ -46,7 +46,7 @@ def _flow(path):
 
 def _shape(path):
     network = ShapeNetwork(ShapeConfig(widths=(4, 8, 8, 8), hidden=8, bins=3))
-    save_shape_model(path, network, {"size": 32, "confidence": [1.0, 0.0]})
+    save_shape_model(path, network, {"size": 32, "confidence": [0.0] * 9})
     return load_shape_model
 
 

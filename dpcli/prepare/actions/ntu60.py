@@ -244,7 +244,7 @@ class NTU60:
             return
         videos = {name: files for name, files in folders.items() if NAME.fullmatch(name.rpartition("/")[2])}
         for name, files in videos.items():
-            yield video_item(name.rpartition("/")[2], path, self.protocol, files=files)
+            yield video_item(name.rpartition("/")[2], path, self.protocol, entries=files)
         if not videos:
             inside = ", ".join(sorted(folders)[:3])
             yield Item(
@@ -284,7 +284,7 @@ class NTU60:
         if "root" in item.extra:
             files: Iterator = folder_files(item.path, item.extra["root"], ".png")
         else:
-            files = zip_folders.read_files(item.path, item.extra["files"])
+            files = zip_folders.read_files(item.path, item.extra["entries"])
         frames, others = [], []
         for name, data in files:
             if match := FRAME.fullmatch(name):

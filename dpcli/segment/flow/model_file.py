@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from copy import deepcopy
 from pathlib import Path
 
 import torch
@@ -46,6 +47,12 @@ def _read_flow_model(path: Path, _changed: int) -> tuple[FlowStep3D, dict]:
     return fill_network(lambda: FlowStep3D(config), tensors, path), notes
 
 
+@functools.lru_cache(maxsize=2)
+def _network_on(path: Path, changed: int, device: str) -> FlowStep3D:
+    """Returns the network of a file on a device: one of its own, since threads that moved the same one at once would meet."""
+    return deepcopy(_read_flow_model(path, changed)[0]).to(device)
+
+
 @torch.inference_mode()
 def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu") -> Tensor:
     """Returns the flow (B,N,3) of clouds (B,N,3), (B,M,3) by the trained network `name`, on the inputs' device.
@@ -53,8 +60,8 @@ def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu
     Each pair is scaled to diameter 1 for the network, clouds of more than 2,048 points are thinned by farthest points and
     the flow is interpolated; below 16 points, or without extent, all shift by the difference of the means.
     """
-    model, _ = load_flow_model(name)
-    model = model.to(device)
+    path = find_flow_model(name)
+    model = _network_on(path, path.stat().st_mtime_ns, device)
     out = [_estimate_pair(model, *(p[None].to(device) for p in pair)) for pair in zip(points1, points2)]
     return torch.cat(out).to(points1.device)
 
