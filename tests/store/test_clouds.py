@@ -233,8 +233,10 @@ def test_several_workers_read_what_one_reads(tmp_path, three):
     """As a DataLoader's do, but for the import of torch in each."""
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)  # an open handle in the parent must not leak into the workers
-    with multiprocessing.get_context("forkserver").Pool(2) as pool:
-        found = pool.map(reader.read, range(3), chunksize=1)
+    pool = multiprocessing.get_context("forkserver").Pool(2)
+    found = pool.map(reader.read, range(3), chunksize=1)
+    pool.close()  # not terminate: workers of the server that another test may have started let no SIGTERM through
+    pool.join()
     assert [np.array_equal(a.points, b.points) for a, b in zip(found, three, strict=True)] == [True] * 3
 
 

@@ -28,7 +28,7 @@ from tests.support.gltf_files import arm, quad
 from tests.support.pretend_card import pretend_card
 
 # two rounds of pictures, as many steps of each; every step ends with a row and a state
-WORDS = ("--preset", "tiny", "--jobs", 1, "--steps", 8, "--set", "reuse=1")
+WORDS = ("--preset", "tiny", "--jobs", 1, "--steps", 8, "--set", "reuse=1", "--set", "validation=6")
 
 
 @pytest.fixture(scope="module")
