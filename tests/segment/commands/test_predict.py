@@ -246,17 +246,20 @@ def test_flows_of_all_pairs_that_take_much_memory_are_told_before_the_work(dpc_h
     assert told not in dpc_here(*words, "--pairs", "all", "--force").stderr.decode()
 
 
-def test_frames_of_more_points_than_are_looked_at_are_told(dpc_here, tmp_path):
-    rng = np.random.default_rng(0)
+def test_frames_of_more_points_than_are_looked_at_are_told(tmp_path, monkeypatch):
+    from dpcli.segment.commands import predict as commands
+
+    rng, lines = np.random.default_rng(0), []
+    monkeypatch.setattr(commands.log, "info", lines.append)
     for name, sizes in (("few.h5", (40, 512)), ("many.h5", (40, 700))):
         with CloudsWriter(tmp_path / name, class_names=[]) as writer:
             writer.write(CloudSequence.from_frames("a", [rng.random((size, 3), np.float32) for size in sizes]))
 
-    def said(name: str, *words: str) -> str:
-        done = dpc_here("segment", "predict", tmp_path / name, "-o", tmp_path / "p.h5", "--force", *words)
-        assert done.returncode == 0
-        return done.stderr.decode()
+    def said(name: str, points: int = 512) -> str:
+        lines.clear()
+        with CloudsReader(tmp_path / name) as reader:
+            commands._tell_of_thinning(reader, [0], points)
+        return "".join(lines)
 
     assert "512 of up to 700 points of a frame are looked at" in said("many.h5")
-    assert "are looked at" not in said("many.h5", "--points", "600")
-    assert "are looked at" not in said("few.h5")
+    assert said("many.h5", 600) == said("few.h5") == ""
