@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from dpcli.prepare.recordings.livox import LIVOX_KINDS, read_livox
@@ -33,7 +34,7 @@ class RosMessages:
     """Decodes the messages of ROS in a recording. channels: all that it has."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
-        self._channels = channels
+        self._channels = tuple(channels)
         self._stores: dict[Channel, Any] = {}
 
     def decode(self, channel: Channel, raw: bytes) -> Any:
@@ -47,7 +48,8 @@ class RosMessages:
         return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, channel.msgtype)
 
 
-def _typestore(channel: Channel, others: Iterable[Channel]) -> Any:
+@lru_cache(maxsize=64)  # recordings of one robot describe their types alike, and to compile these takes longest
+def _typestore(channel: Channel, others: tuple[Channel, ...]) -> Any:
     """Returns what knows the type of a channel of ROS as the file describes it, else as ROS does.
 
     others: channels whose descriptions may hold types that the channel's own one uses and lacks.
