@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -42,14 +43,22 @@ def pack_rvl(depth: np.ndarray) -> bytes:
     return struct.pack(f"<ii{len(words)}I", depth.shape[1], depth.shape[0], *words)
 
 
+def new_store(ros1: bool) -> Any:
+    """Knows the messages of ROS 1 or ROS 2; a test may add its own types to it."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+_shared_store = cache(new_store)  # which compiles each type once
+
+
 class Messages:
     """Makes messages of ROS 1 (``bag``) or ROS 2, whose classes and headers differ a little."""
 
     def __init__(self, kind: str) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
         self.ros1 = kind == "bag"
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        self.store = _shared_store(self.ros1)
 
     def make(self, kind: str, /, **values: Any) -> Any:
         return self.store.types[kind](**values)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError
 from dpcli.prepare.recordings.livox import read_livox
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
-from tests.support.recording_helpers import KINDS, START, Messages, write_recording
+from tests.support.recording_helpers import KINDS, START, Messages, new_store, write_recording
 
 pytest.importorskip("rosbags")
 RNG = np.random.default_rng(0)
@@ -26,6 +26,7 @@ def messages(kind: str, package: str = "livox_ros_driver") -> Messages:
     from rosbags.typesys import get_types_from_msg
 
     make = Messages(kind)
+    make.store = new_store(make.ros1)
     make.store.register(get_types_from_msg(POINT, f"{package}/msg/CustomPoint"))
     make.store.register(get_types_from_msg(SCAN, f"{package}/msg/CustomMsg"))
     return make
