@@ -117,7 +117,9 @@ def test_a_rate_tells_the_unit_of_times_in_whole_numbers(tmp_path, name, values,
 @pytest.mark.parametrize("written", ["spreadsheet", "matlab", "clock", "digits", "milliseconds"])
 @pytest.mark.parametrize("as_frames", [False, True])
 def test_moments_written_as_days_or_as_digits_are_seconds(tmp_path, rate, written, as_frames):
-    moments = [datetime(2024, 3, 5, 14, 59, 50) + timedelta(seconds=k / rate) for k in range(12 * rate)]
+    before, after = (10, 2) if rate < 200 else (1, 1)  # seconds around a full hour
+    start = datetime(2024, 3, 5, 15) - timedelta(seconds=before)
+    moments = [start + timedelta(seconds=k / rate) for k in range((before + after) * rate)]
     days = [(moment - datetime(1899, 12, 30)) / timedelta(days=1) for moment in moments]
     values = {
         "spreadsheet": [f"{day:.11f}" for day in days],

@@ -9,7 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -922,6 +922,7 @@ def seen_points(seed: int, views: int) -> tuple[np.ndarray, np.ndarray, list, li
     return lenses, poses, boxes, [(320, 240)] * views
 
 
+@settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 6))
 def test_right_cameras_leave_all_of_every_box_possible(seed, views):
     shares = shares_of_boxes(*seen_points(seed, views))
