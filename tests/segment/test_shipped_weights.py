@@ -20,7 +20,7 @@ def test_every_shipped_model_loads_has_a_card_and_names_no_machine():
 
 def test_it_finds_parts_of_objects_it_never_saw(dpc_here, one_thread, tmp_path):
     """Procedural objects are not what it learned from; it beats "all one part" on them."""
-    words = ("--objects", 6, "--sequences-per-object", 1)
+    words = ("--objects", 3, "--sequences-per-object", 1)
     made = dpc_here("prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", *words)
     assert made.returncode == 0, made.stderr.decode()
     score = {}

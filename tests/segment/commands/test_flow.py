@@ -10,7 +10,7 @@ from tests.support.drawers import TRAIN
 
 def test_a_flow_estimator_is_trained_and_used(dpc_here, one_thread, data, tmp_path):
     folder = tmp_path / "flow"
-    done = dpc_here("segment", "flow", data, "-o", folder, "--steps", 3, "--batch", 2)
+    done = dpc_here("segment", "flow", data, "-o", folder, "--steps", 3, "--batch", 2, "--set", "points=48")
     assert done.returncode == 0, done.stderr.decode()
     assert (folder / "curves.png").exists() and done.stdout.decode().strip().endswith("best.safetensors")
     words = ("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5")

@@ -162,7 +162,7 @@ def test_sequences_whose_names_are_one_file_name_have_a_file_each(few, tmp_path)
 def test_a_urdf_is_in_meters_whatever_the_clouds_are_in(few, tmp_path, dpc_here):
     """The JSON keeps the file's own unit."""
     with h5py.File(shutil.copyfile(few, tmp_path / "mm.h5"), "r+") as file:
-        name, file.attrs["length_unit"] = file["name"][0].decode(), "mm"
+        name, file.attrs["length_unit"] = file["name"][1].decode(), "mm"  # the one of fewer parts
         file["points"][:] = 1000 * file["points"][:]
         file["part_motion"][..., :3, 3] = 1000 * file["part_motion"][..., :3, 3]
     for parts, output in ((few, "m.urdf"), (tmp_path / "mm.h5", "mm.urdf"), (tmp_path / "mm.h5", "mm.json")):

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from typer.testing import CliRunner
 
 from dpcli.cli.app import app
 from dpcli.errors import DataError
+from dpcli.segment.training.trainer import Trainer
 from dpcli.store import CloudsWriter
 from dpcli.text_files import read_toml
 from tests.support.drawers import TRAIN, drawer, predicted
@@ -68,25 +68,42 @@ def test_a_finished_run_needs_its_flows_no_more(dpc_here, data, run_folder, tmp_
     assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == before
 
 
-def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, dpc_here, tmp_path):
+KILLED = """
+import os, signal, sys
+from dpcli.cli.app import main
+from dpcli.segment.training.trainer import Trainer
+
+keep = Trainer._keep_flow
+
+def keep_and_die(self, pairs, flow):
+    keep(self, pairs, flow)
+    if (self.epoch, self.step) == (1, 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+Trainer._keep_flow = keep_and_die
+main(sys.argv[1:])
+"""
+
+
+def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, dpc_here, tmp_path, monkeypatch):
     """SIGTERM saves and exits 75; kill -9 loses what came after the last checkpoint; weights and flows come out equal."""
     folder = tmp_path / "killed"
     words = ("segment", "train", data, "-o", folder, *TRAIN)
-    command = [sys.executable, "-m", "dpcli", *words]
+    with monkeypatch.context() as patch:
+        step = Trainer._step
+
+        def step_and_stop(self, *given):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return step(self, *given)
+
+        patch.setattr(Trainer, "_step", step_and_stop)
+        stopped = dpc_here(*words)
+    assert stopped.returncode == 75 and b"saved at epoch 1, step 1" in stopped.stderr, stopped.stderr
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
-    codes = []
-    for number, wait_for in ((signal.SIGTERM, "flows.npy"), (signal.SIGKILL, "state.pt")):
-        process = subprocess.Popen(
-            [str(w) for w in command], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-        )
-        deadline = time.time() + 120
-        while not (folder / wait_for).exists() and process.poll() is None and time.time() < deadline:
-            time.sleep(0.02)
-        time.sleep(0.3)
-        process.send_signal(number)
-        process.communicate(timeout=120)
-        codes.append(process.returncode)
-    assert codes[0] in (75, 0) and codes[1] in (-9, 0)
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, *map(str, words)], env=environment, capture_output=True, timeout=120
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
     done = dpc_here(*words)
     assert done.returncode == 0, done.stderr
     from safetensors.torch import load_file

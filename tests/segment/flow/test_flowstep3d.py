@@ -135,12 +135,14 @@ def data(tmp_path_factory) -> Path:
     return path
 
 
-def train(data: Path, folder: Path, steps: int, stop: StopRequest | None = None, batch: int = 2) -> FlowStep3D:
+def train(
+    data: Path, folder: Path, steps: int, stop: StopRequest | None = None, batch: int = 2, config: FlowConfig = TINY
+) -> FlowStep3D:
     run = RunFolder(folder, {"seed": 1}, columns=COLUMNS)
     schedule, device = FlowSchedule(steps=steps, batch=batch, points=64), torch.device("cpu")
     with CloudsReader(data) as reader:
         trainer = FlowTrainer(
-            reader, run, FlowConfig(), schedule, seed=1, device=device, stop=stop or StopRequest(), log_every=5
+            reader, run, config, schedule, seed=1, device=device, stop=stop or StopRequest(), log_every=5
         )
         with run:
             return trainer.run()
@@ -174,7 +176,7 @@ def test_stopped_and_continued_is_the_same(data: Path, tmp_path: Path) -> None:
 
 
 def test_training_lowers_the_loss_and_its_file_estimates_flow(data: Path, tmp_path: Path) -> None:
-    train(data, tmp_path / "run", 25, batch=4)
+    train(data, tmp_path / "run", 25, batch=4, config=FlowConfig(iterations=2))
     rows = json.loads((tmp_path / "run" / "log.json").read_text())
     assert rows[-1]["loss"] < rows[0]["loss"] and rows[-1]["validation_loss"] < rows[0]["validation_loss"]
     assert all(np.isfinite(row["validation_epe"]) for row in rows)

@@ -167,11 +167,11 @@ def test_one_part_has_no_joint_and_frames_apart_are_a_sentence():
 
 def test_many_parts_two_frames_and_a_huge_place_make_a_tree():
     rng = np.random.default_rng(4)
-    boxes = [(rng.uniform(-1, 1, 3), (0.2, 0.2, 0.2)) for _ in range(9)]
-    poses = np.array([[np.eye(4)] * 9, [about(rng.normal(size=3) * 0.1, 1) for _ in range(9)]])
+    boxes = [(rng.uniform(-1, 1, 3), (0.2, 0.2, 0.2)) for _ in range(6)]
+    poses = np.array([[np.eye(4)] * 6, [about(rng.normal(size=3) * 0.1, 1) for _ in range(6)]])
     poses[:, :, :3, 3] += 1e4
     tree = kinematic_tree(*made(poses, boxes, points=20))
-    assert len(tree.joints) == 8 and {j.child for j in tree.joints} | {tree.root} == set(range(9))
+    assert len(tree.joints) == 5 and {j.child for j in tree.joints} | {tree.root} == set(range(6))
 
 
 def test_a_part_that_vanishes_keeps_the_others_right():

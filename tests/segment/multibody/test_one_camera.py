@@ -1,9 +1,12 @@
 """What one camera sees: points that turned out of its sight, and where it stood."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dpcli.segment.multibody.explanation import Explanation
 from dpcli.segment.multibody.frames import Frames
 from dpcli.segment.multibody.hypotheses import find_hypotheses
 from dpcli.segment.multibody.search import Search, explain_sequence
@@ -38,13 +41,19 @@ def test_sides_that_turn_out_of_sight_are_no_parts(seed):
     assert len(found.bodies) == 1  # two or three without the camera
 
 
-def camera_of(clouds: list[np.ndarray], origin: np.ndarray) -> np.ndarray | None:
-    frames = Frames(clouds)
-    return find_camera(frames, Search(frames, MultibodySettings(), find_hypotheses(frames)).begin(), origin)
+@lru_cache(maxsize=2)
+def explained(seed: int, all_sides: bool) -> tuple[Frames, Explanation]:
+    """The frames of a turning box, and the first explanation of them, which knows no camera."""
+    frames = Frames(turning_box(seed, all_sides=all_sides))
+    return frames, Search(frames, MultibodySettings(), find_hypotheses(frames)).begin()
+
+
+def camera_of(origin: np.ndarray, seed: int = 5, all_sides: bool = False) -> np.ndarray | None:
+    return find_camera(*explained(seed, all_sides), origin)
 
 
 def test_a_camera_is_found_within_20_degrees_if_the_clouds_show_one_side():
-    camera = camera_of(turning_box(5), np.zeros(3))
+    camera = camera_of(np.zeros(3))
     eye = -camera[:, :3].T @ camera[:, 3]
     assert eye @ EYE / np.linalg.norm(eye) / np.linalg.norm(EYE) > np.cos(np.radians(20))
     np.testing.assert_allclose(camera[:, :3] @ camera[:, :3].T, np.eye(3), atol=1e-12)
@@ -53,11 +62,11 @@ def test_a_camera_is_found_within_20_degrees_if_the_clouds_show_one_side():
 
 @pytest.mark.parametrize("origin", [np.zeros(3), EYE, np.full(3, 1e9)], ids=["amid", "outside", "far"])
 def test_clouds_of_all_sides_have_no_camera(origin):
-    assert camera_of(turning_box(5, all_sides=True), origin) is None
+    assert camera_of(origin, all_sides=True) is None
 
 
 def test_the_camera_at_the_origin_is_taken_as_it_is():
-    camera = camera_of(turning_box(3), EYE)
+    camera = camera_of(EYE)
     np.testing.assert_allclose(-camera[:, :3].T @ camera[:, 3], EYE, atol=1e-9)
 
 
