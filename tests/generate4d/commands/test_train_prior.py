@@ -16,12 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file
 
 from dpcli.generate4d.commands.train_prior import train_shape_prior
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
-from dpcli.generate4d.shape.training.rounds import Sources
+from dpcli.generate4d.shape.training.rounds import Sources, Window
 from dpcli.generate4d.shape.training.settings import PRESETS, ShapeTraining
+from dpcli.generate4d.shape.training.trainer import ShapeTrainer
 from dpcli.prepare.synthetic.shape_pictures import picture_sources
 from tests.support.commands import exit_code
 from tests.support.gltf_files import arm, quad
@@ -31,12 +33,20 @@ from tests.support.pretend_card import pretend_card
 WORDS = ("--preset", "tiny", "--jobs", 1, "--steps", 8, "--set", "reuse=1", "--set", "validation=6")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    """As the fixture `one_thread`: all trainings here, also that of a process of its own, add in one order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A training that nobody stopped, in a process of its own: other tests here may have changed how torch counts threads."""
+    """A training that nobody stopped."""
     folder = tmp_path_factory.mktemp("prior") / "run"
-    command = [sys.executable, "-m", "dpcli", "generate4d", "train-prior", "-o", folder, *WORDS]
-    assert subprocess.run([str(word) for word in command], capture_output=True, timeout=200).returncode == 0
+    assert exit_code("generate4d", "train-prior", "-o", folder, *WORDS) == 0
     return folder
 
 
@@ -50,22 +60,29 @@ def test_training_leaves_what_people_look_for(trained):
         assert len(list(csv.DictReader(file))) == len(rows)
 
 
-def test_a_stopped_run_ends_like_one_that_was_not(trained, tmp_path):
+def test_a_stopped_run_ends_like_one_that_was_not(trained, tmp_path, monkeypatch):
     """SIGTERM saves and exits 75, kill -9 goes back to the last saved state; the weights are equal to the bit."""
-    folder = tmp_path / "stopped"
-    command = [str(w) for w in (sys.executable, "-m", "dpcli", "generate4d", "train-prior", "-o", folder, *WORDS)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
-    codes = []
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        before, deadline = _step(folder), time.time() + 200
-        while _step(folder) <= before + 1 and process.poll() is None and time.time() < deadline:
-            time.sleep(0.02)
-        process.send_signal(number)
-        codes.append(process.wait(timeout=200))
-    assert codes[0] in (75, 0) and codes[1] in (-9, 0)
-    assert subprocess.run(command, env=environment, capture_output=True, timeout=200).returncode == 0
-    ours, theirs = (load_file(place / "last.safetensors") for place in (folder, trained))
+    words = ("generate4d", "train-prior", "-o", tmp_path / "stopped", *WORDS)
+    step = ShapeTrainer._one_step
+
+    def terminated(trainer: ShapeTrainer, window: Window) -> None:
+        if trainer.step == 2:
+            signal.raise_signal(signal.SIGTERM)
+        step(trainer, window)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ShapeTrainer, "_one_step", terminated)
+        assert exit_code(*words) == 75 and _step(tmp_path / "stopped") == 3
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen([sys.executable, "-m", "dpcli", *map(str, words)], env=environment, **silent)
+    deadline = time.monotonic() + 200
+    while _step(tmp_path / "stopped") <= 4 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    assert process.wait(timeout=200) in (-9, 0)
+    assert exit_code(*words) == 0
+    ours, theirs = (load_file(place / "last.safetensors") for place in (tmp_path / "stopped", trained))
     assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
 
 
