@@ -6,9 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import UsageError
 from dpcli.evaluate.bootstrap import (
     Resampling,
@@ -27,6 +25,7 @@ from dpcli.evaluate.segmentation.metrics import SegmentationStatistics, segmenta
 from dpcli.evaluate.segmentation.motion_metrics import TAUS, MotionStatistics, motion_compute, motion_weighted
 from dpcli.runtime.seeds import generator
 from dpcli.store import ScoresWriter
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 
@@ -284,7 +283,7 @@ def files(tmp_path_factory):
 
 
 def run(*arguments: object):
-    result = CliRunner().invoke(evaluate.ROOM.application(), [str(a) for a in arguments])
+    result = evaluate(*arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.stdout

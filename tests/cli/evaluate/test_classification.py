@@ -9,9 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.cli.evaluate.output import print_tables
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.classification.protocol import evaluate_classification
@@ -19,6 +17,7 @@ from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.classification.tables import classification_notes, classification_tables
 from dpcli.evaluate.text_tables import markdown_tables
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from tests.support.evaluating import evaluate
 
 NAMES = ("wave", "push", "pull")
 # (name, split, label, static's best, dynamic's best, fused best)
@@ -52,7 +51,7 @@ def write_truth(path: Path, labels: dict[str, int], names: tuple[str, ...] = NAM
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(evaluate.ROOM.application(), ["classification", *(str(a) for a in arguments)])
+    return evaluate("classification", *arguments)
 
 
 def test_json_by_hand(scores: Path) -> None:

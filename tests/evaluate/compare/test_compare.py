@@ -10,9 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import rankdata
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Resampling, bootstrap, means_of_samples
 from dpcli.evaluate.classification.protocol import evaluate_classification
@@ -25,6 +23,7 @@ from dpcli.evaluate.compare.significance_tests import mcnemar
 from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.text_tables import resampling_note
 from dpcli.store import PartsReader, PartsWriter, ScoresWriter
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scores_helpers import CLASSES, write_scores
 
@@ -57,10 +56,7 @@ def test_numbers_are_those_of_the_single_commands(run, parts, scores):
     found = json.loads(run("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--json"))["metrics"]
     for task in ("segmentation", "motion"):
         for side, name in (("a", "good"), ("b", "twin")):
-            result = CliRunner().invoke(
-                evaluate.ROOM.application(),
-                [task, str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
-            )
+            result = evaluate(task, parts[name], "--truth", parts["truth"], "--json", "--resamples", 0)
             for key, value in json.loads(result.stdout)["metrics"].items():
                 if key in found:
                     assert found[key][side] == pytest.approx(value, abs=1e-12), key

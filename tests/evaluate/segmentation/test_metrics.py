@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
-from typer.testing import CliRunner
 
-from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
@@ -27,6 +25,7 @@ from dpcli.evaluate.segmentation.metrics import (
 from dpcli.evaluate.segmentation.part_matching import match_parts, mean_iou
 from dpcli.evaluate.segmentation.protocol import compressed_over_pairs, evaluate_segmentation
 from dpcli.evaluate.segmentation.rand_index import rand_index
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 TOLERANCE = 1e-6
@@ -302,7 +301,7 @@ def files(tmp_path, truths) -> tuple[Path, Path]:
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, ["evaluate", "segmentation", *(str(a) for a in arguments)])
+    return evaluate("segmentation", *arguments)
 
 
 def test_json_says_numbers_units_and_denominators(files):
@@ -381,8 +380,8 @@ def test_small_true_parts_can_be_ignored(files):
 
 def test_a_pipe_gives_the_same(files):
     parts, truth = files
-    words = ["evaluate", "segmentation", "-", "--truth", str(truth), "--json"]
-    found = json.loads(CliRunner().invoke(app, words, input=parts.read_bytes()).stdout)
+    piped = evaluate("segmentation", "-", "--truth", truth, "--json", stdin=parts.read_bytes())
+    found = json.loads(piped.stdout)
     assert found["metrics"] == json.loads(run(parts, "--truth", truth, "--json").stdout)["metrics"]
 
 

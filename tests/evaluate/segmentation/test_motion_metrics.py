@@ -10,13 +10,12 @@ import h5py
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import FlowShares, flow_update, motion_compute, part_motion_update
 from dpcli.evaluate.segmentation.rigid_motion import rotation_angle, true_flow, true_motion
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import CHAIN, perfect, rigid, rotation, truth_sequence, write_parts, write_truth
 
 TOLERANCE = 1e-6
@@ -158,7 +157,7 @@ def truths() -> list:
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, ["evaluate", "motion", *(str(a) for a in arguments)])
+    return evaluate("motion", *arguments)
 
 
 def test_the_truth_has_no_error_and_a_broken_twin_has(tmp_path, truths) -> None:
