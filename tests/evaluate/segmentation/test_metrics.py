@@ -285,19 +285,24 @@ def test_published_ids_are_counted_over_a_pair_of_frames():
 # ---- the protocol on files, and the command ----
 
 
-@pytest.fixture
-def truths() -> list:
+def objects() -> list:
     return [truth_sequence(f"s{i}", seed=i, label=i % 2, split="train" if i == 3 else "test") for i in range(4)]
 
 
 @pytest.fixture
-def files(tmp_path, truths) -> tuple[Path, Path]:
+def truths() -> list:
+    return objects()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> tuple[Path, Path]:
     """Truth of three test objects and one of training; the first predicted perfectly, the others as one part."""
+    folder, truths = tmp_path_factory.mktemp("files"), objects()
     samples = [perfect(truth, 4, slots=np.array([2, 0, 3, 1])) for truth in truths[:3]]
     for sequence, probability, *_ in samples[1:]:
         sequence.part[:] = 0
         probability[:] = [0.7, 0.1, 0.1, 0.1]
-    return write_parts(tmp_path / "parts.h5", samples), write_truth(tmp_path / "truth.h5", truths)
+    return write_parts(folder / "parts.h5", samples), write_truth(folder / "truth.h5", truths)
 
 
 def run(*arguments: object):
