@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -38,14 +38,15 @@ class ClassificationReport:
     split: str
     truth: str
     streams: dict[str, ClassificationMetrics]
-    left_out: list[LeftOut] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    labels: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    scores: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
-    calibration: dict[str, Calibration | None] = field(default_factory=dict)
-    rejected: np.ndarray | None = None  # bool (S), of the samples that count
+    left_out: list[LeftOut]
+    names: list[str]
+    labels: np.ndarray
+    scores: np.ndarray
+    resampling: Resampling
+    intervals: dict[str, dict[str, Interval]]
+    calibration: dict[str, Calibration | None]
+    rejected: np.ndarray | None  # bool (S), of the samples that count
+    provenance: list[dict]
 
     @property
     def accepted(self) -> tuple[int, int] | None:
@@ -102,6 +103,7 @@ def evaluate_classification(
         resampling=resampling,
         intervals={name: resampling.intervals(_metric(rows, labels), len(labels)) for name, rows in streams.items()},
         rejected=None if scores.rejected is None else scores.rejected[keep],
+        provenance=scores.provenance,
         calibration={name: calibrate(rows, labels) for name, rows in streams.items()},
     )
 

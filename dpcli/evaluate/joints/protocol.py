@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +49,9 @@ class JointReport:
     total: JointStatistics
     counts: dict[int, JointStatistics]
     resampling: Resampling
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    poses: bool = True
+    intervals: dict[str, Interval]
+    poses: bool
+    provenance: list[dict]
 
 
 def evaluate_joints(
@@ -96,6 +97,7 @@ def evaluate_joints(
         resampling,
         resampling.intervals(_weighted(found), len(found)),
         "pose" in paired.truth.fields,
+        paired.predicted.provenance,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from dpcli.counted import counted
@@ -84,10 +83,10 @@ def joint_notes(report: JointReport) -> list[str]:
     ]
 
 
-def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def joint_json(report: JointReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
-    source: the parts file, as it was named. provenance: that of the file.
+    source: the parts file, as it was named.
     """
     unit = report.length_unit
     rows = {label: _numbers(own) | _counts(report.counts[label]) for label, own in report.classes.items()}
@@ -108,7 +107,7 @@ def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()
         "units": units | {"state_angle": "degree", "state_length": unit},
         "denominators": {"sequences": len(report.names), **_counts(report.total)},
         "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
+        "provenance": report.provenance,
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
 from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import (
@@ -41,9 +41,9 @@ from dpcli.store.schema import METERS
 class MotionReport:
     """Holds the metrics of all sequences, and of those of each label that occurs.
 
-    names, statistics, pairs: each sequence that counts, its statistics and frame pairs i (Q,2). intervals: by metric
-    (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true flow
-    is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
+    names, pairs: each sequence that counts and its frame pairs i (Q,2). metric: of how often each counts. intervals: by
+    metric (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true
+    flow is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
     """
 
     protocol: str
@@ -54,14 +54,14 @@ class MotionReport:
     classes: dict[int, MotionMetrics]
     class_names: list[str]
     left_out: list[LeftOut]
-    sequences: int
-    names: list[str] = field(default_factory=list)
-    statistics: list[MotionStatistics] = field(default_factory=list)
-    pairs: list[np.ndarray] = field(default_factory=list)
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    from_poses: bool = True
-    without_truth: int = 0
+    names: list[str]
+    pairs: list[np.ndarray]
+    metric: WeightedMetric
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    from_poses: bool
+    without_truth: int
+    provenance: list[dict]
 
 
 def evaluate_motion(
@@ -119,14 +119,14 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
         ),
         counted.class_names,
         [*counted.left_out, *([LeftOut(reason, without_pairs)] if without_pairs else [])],
-        len(statistics),
         [name for name, _ in found],
-        statistics,
         [row["pairs"] for _, row in found],
+        metric,
         resampling,
         resampling.intervals(metric, len(statistics)),
         from_poses,
         without_truth,
+        counted.provenance,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
 from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
@@ -45,7 +45,7 @@ FIXES = (
 class SegmentationReport:
     """Holds the metrics of all sequences, and of those of each label that occurs; `objects` has what pictures need.
 
-    names, sequences: each sequence that counts and its statistics; intervals: by metric, empty without `resampling`.
+    names: the sequences that count. metric: of how often each counts. intervals: by metric, empty without `resampling`.
     """
 
     protocol: str
@@ -57,10 +57,11 @@ class SegmentationReport:
     classes: dict[int, SegmentationMetrics]
     class_names: list[str]
     left_out: list[LeftOut]
-    names: list[str] = field(default_factory=list)
-    sequences: list[SegmentationStatistics] = field(default_factory=list)
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, Interval] = field(default_factory=dict)
+    names: list[str]
+    metric: WeightedMetric
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    provenance: list[dict]
 
 
 def evaluate_segmentation(
@@ -100,6 +101,7 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
     if whole.frames == 0:
         of_size = f" of at least {ignore_below} points" if ignore_below else ""
         raise DataError(f"{about['truth']}: not one frame has a true part{of_size}")
+    metric = segmentation_weighted(sequences, protocol)
     return SegmentationReport(
         protocol,
         ignore_below,
@@ -111,9 +113,10 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
         counted.class_names,
         counted.left_out,
         counted.names,
-        sequences,
+        metric,
         resampling,
-        resampling.intervals(segmentation_weighted(sequences, protocol), len(sequences)),
+        resampling.intervals(metric, len(sequences)),
+        counted.provenance,
     )
 
 

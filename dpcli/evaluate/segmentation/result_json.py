@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -22,10 +21,10 @@ def segmentation_scores(metrics: SegmentationMetrics) -> dict[str, float | None]
     return {key: none_if_nan(getattr(metrics, key)) for key in SEGMENTATION_METRICS}
 
 
-def segmentation_json(report: SegmentationReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def segmentation_json(report: SegmentationReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
-    source: the parts file, as it was named. provenance: that of the file.
+    source: the parts file, as it was named.
     """
     rows = {label: segmentation_scores(own) | _segmentation_counts(own) for label, own in report.classes.items()}
     return {
@@ -47,7 +46,7 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
         "units": dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
         "denominators": _segmentation_counts(report.main),
         "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
+        "provenance": report.provenance,
     }
 
 
@@ -65,15 +64,15 @@ def _segmentation_counts(metrics: SegmentationMetrics) -> dict[str, int]:
     }
 
 
-def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def motion_json(report: MotionReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
     accs, accr, outlier are those of the protocol's own tau; `thresholds` has both. source: the parts file, as it was
-    named. provenance: that of the file.
+    named.
     """
     unit, tau = report.length_unit, MAIN_TAU[report.protocol]
     rows = {label: _motion_numbers(own, tau) | _motion_counts(own) for label, own in report.classes.items()}
-    counts = {"sequences": report.sequences, **_motion_counts(report.main)}
+    counts = {"sequences": len(report.names), **_motion_counts(report.main)}
     return {
         "task": "motion",
         "input": source,
@@ -91,7 +90,7 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
         },
         "denominators": counts | {"pairs_without_truth": report.without_truth},
         "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
+        "provenance": report.provenance,
     }
 
 

@@ -45,6 +45,7 @@ class SegmentsReport:
     resampling: Resampling
     truth: str
     left_out: list[LeftOut]
+    provenance: list[dict]
 
 
 def evaluate_segments(
@@ -63,7 +64,8 @@ def evaluate_segments(
     counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
     metric = segments_weighted(counts)
     values = {key: float(value[0]) for key, value in metric(np.ones((1, len(counts)))).items()}
-    return SegmentsReport(names, counts, values, resampling.intervals(metric, len(counts)), resampling, truth, left_out)
+    intervals = resampling.intervals(metric, len(counts))
+    return SegmentsReport(names, counts, values, intervals, resampling, truth, left_out, predicted.provenance)
 
 
 def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: str, intersect: bool) -> list[LeftOut]:
@@ -108,8 +110,8 @@ def segments_notes(report: SegmentsReport) -> list[str]:
     ]
 
 
-def segments_json(report: SegmentsReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
-    """Returns the report as `--json` prints it. source: the predicted table, as it was named; provenance: its own."""
+def segments_json(report: SegmentsReport, source: str) -> dict[str, Any]:
+    """Returns the report as `--json` prints it. source: the predicted table, as it was named."""
     counts = report.counts
     rows = [
         {"name": name, "frames": one.frames, "right": one.right, "true": one.true, "predicted": one.predicted}
@@ -130,5 +132,5 @@ def segments_json(report: SegmentsReport, source: str, provenance: Sequence[dict
             "predicted_segments": sum(one.predicted for one in counts),
         },
         "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
+        "provenance": report.provenance,
     }

@@ -49,7 +49,7 @@ class VideoReport:
     missing: dict[str, str] = field(default_factory=dict)
     scene: dict[str, Any] = field(default_factory=dict)
     length_unit: str = ""
-    history: list[dict] = field(default_factory=list)
+    provenance: list[dict] = field(default_factory=list)
     resampling: Resampling = NO_INTERVALS
     intervals: dict[str, Interval] = field(default_factory=dict)
 
@@ -113,7 +113,7 @@ def evaluate_video(
             missing,
             _scene_scores(predicted, real, names, seed),
             real.header.length_unit if real.header else "",
-            list(predicted.history),
+            list(predicted.provenance),
             resampling,
         )
         report.intervals = _intervals(report)

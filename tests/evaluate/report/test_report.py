@@ -110,11 +110,8 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
     from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.classification.protocol import evaluate_classification
     from dpcli.evaluate.classification.result_json import classification_json
-    from dpcli.store import ScoresReader
 
-    found = classification_json(
-        evaluate_classification(scores, resampling=Resampling()), str(scores), ScoresReader(scores).provenance
-    )
+    found = classification_json(evaluate_classification(scores, resampling=Resampling()), str(scores))
     (folder / "one.json").write_text(json.dumps(found))
     direct, printed = (arrange(collect([str(own)])) for own in (scores, folder / "one.json"))
     assert report_html(direct) == report_html(printed)
