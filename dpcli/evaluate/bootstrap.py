@@ -52,6 +52,9 @@ class Resampling:
         return bootstrap(metric, samples, rng, resamples=self.resamples, confidence=self.confidence)
 
 
+NO_INTERVALS = Resampling(0)
+
+
 @dataclass(frozen=True)
 class Interval:
     """Holds the ends of an interval in the metric's own unit; NaN = undefined (fewer than two samples, or a metric of 0/0)."""

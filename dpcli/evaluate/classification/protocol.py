@@ -10,7 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.classification.calibration import Calibration, are_probabilities, calibrate, calibration_weighted
 from dpcli.evaluate.classification.metrics import (
     ClassificationMetrics,
@@ -19,7 +19,7 @@ from dpcli.evaluate.classification.metrics import (
     predicted_labels,
 )
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
-from dpcli.evaluate.results import LeftOut, counted_split, tell_split
+from dpcli.evaluate.results import LeftOut, counted_split, left_out, tell_split
 from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader
 
@@ -68,7 +68,7 @@ def evaluate_classification(
     split: str | None = None,
     *,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
 ) -> ClassificationReport:
     """Returns the metrics of a scores file.
 
@@ -78,13 +78,13 @@ def evaluate_classification(
     Raises DataError when nothing is left, the split doesn't exist, or truth and scores don't hold the same samples
     (with `intersect` those on one side only are left out) and classes.
     """
-    scores, resampling = ScoresReader(path), resampling or Resampling(0)
+    scores = ScoresReader(path)
     if not scores.names:
         raise DataError(f"{path}: holds no samples; predict again")
     found = labels_in_file(scores) if truth is None else match_labels(scores, truth, split, intersect)
     tell_split(truth or path, split, found.splits)
     split = counted_split(split, found.splits)
-    keep, left_out = _choose_samples(scores, found, split)
+    keep, others = _choose_samples(scores, found, split)
     labels = found.labels[keep]
     _tell_first_label(truth or path, scores.scores[keep], labels)
     streams = {name: rows[keep] for name, rows in _streams(scores).items()}
@@ -96,7 +96,7 @@ def evaluate_classification(
             name: classification_metrics(rows, labels, confidence=resampling.confidence)
             for name, rows in streams.items()
         },
-        left_out=left_out,
+        left_out=others,
         names=_names(scores, keep),
         labels=labels,
         scores=scores.scores[keep],
@@ -144,12 +144,11 @@ def _choose_samples(scores: ScoresReader, found: TruthLabels, split: str) -> tup
     if not keep.any():
         count = int(of_split.sum())
         raise DataError(f"{scores.path}: {counted(count, 'sample')} without a label; give the truth with --truth FILE")
-    left_out = [
-        *found.left_out,
-        LeftOut(f"not of split {split!r}", _names(scores, found.in_truth & ~of_split)),
-        LeftOut("unknown label (-1)", _names(scores, of_split & ~labeled)),
-    ]
-    return keep, [entry for entry in left_out if entry.names]
+    others = {
+        f"not of split {split!r}": _names(scores, found.in_truth & ~of_split),
+        "unknown label (-1)": _names(scores, of_split & ~labeled),
+    }
+    return keep, [*found.left_out, *left_out(others)]
 
 
 def _names(scores: ScoresReader, chosen: np.ndarray) -> list[str]:

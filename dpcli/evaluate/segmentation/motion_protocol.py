@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
+from dpcli.evaluate.results import LeftOut, left_out, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import (
     MAIN_TAU,
     RELEASE_BATCH,
@@ -71,7 +71,7 @@ def evaluate_motion(
     protocol: str = "dpc",
     split: str | None = None,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
     keeping: Keeping = NOT_KEPT,
 ) -> MotionReport:
     """Returns the metrics of all frame pairs of a parts file against the `part` and `pose` of a clouds file.
@@ -95,7 +95,7 @@ def evaluate_motion(
             meters = METERS.get(paired.truth.length_unit, 1.0)
             measure = partial(_sequence_values, from_poses=from_poses, truth=str(truth), meters=meters)
             counted = count_sequences(paired, measure, about, keeping)
-    return _make_report(counted, path, resampling or Resampling(0))
+    return _make_report(counted, path, resampling)
 
 
 def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> MotionReport:
@@ -118,7 +118,7 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
             [row["label"] for _, row in found], statistics, lambda own: motion_compute(merge_statistics(own), batch)
         ),
         counted.class_names,
-        [*counted.left_out, *([LeftOut(reason, without_pairs)] if without_pairs else [])],
+        [*counted.left_out, *left_out({reason: without_pairs})],
         [name for name, _ in found],
         [row["pairs"] for _, row in found],
         metric,

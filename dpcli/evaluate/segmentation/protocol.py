@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
 from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
@@ -72,7 +72,7 @@ def evaluate_segmentation(
     ignore_below: int = 0,
     split: str | None = None,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
     keeping: Keeping = NOT_KEPT,
 ) -> SegmentationReport:
     """Returns the metrics of a parts file against the `part` of a clouds file, over all frames of all sequences that count.
@@ -90,7 +90,7 @@ def evaluate_segmentation(
             about = {"task": "segmentation", "protocol": protocol, "ignore_below": ignore_below}
             measure = partial(_sequence_values, protocol=protocol, ignore_below=ignore_below)
             counted = count_sequences(paired, measure, about, keeping)
-    return _make_report(counted, path, resampling or Resampling(0))
+    return _make_report(counted, path, resampling)
 
 
 def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> SegmentationReport:

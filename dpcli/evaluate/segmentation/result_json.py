@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.evaluate.choices import SEGMENTATION_METRICS
-from dpcli.evaluate.results import class_rows_json, intervals_json, left_out_json, none_if_nan, samples_json
+from dpcli.evaluate.results import class_rows_json, none_if_nan, report_json
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics, tau_unit
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
@@ -27,10 +27,12 @@ def segmentation_json(report: SegmentationReport, source: str) -> dict[str, Any]
     source: the parts file, as it was named.
     """
     rows = {label: segmentation_scores(own) | _segmentation_counts(own) for label, own in report.classes.items()}
-    return {
-        "task": "segmentation",
-        "input": source,
-        "protocol": {
+    return report_json(
+        "segmentation",
+        source,
+        report,
+        "sequences",
+        protocol={
             "name": report.protocol,
             "split": report.split,
             "truth": report.truth,
@@ -40,14 +42,10 @@ def segmentation_json(report: SegmentationReport, source: str) -> dict[str, Any]
             "ap_pq_f1_pre_rec": "pooled over all frames of all sequences",
             "miou_ri": "mean over the frames of a sequence, then over sequences",
         },
-        "metrics": segmentation_scores(report.main) | {"per_class": class_rows_json(rows, report.class_names)},
-        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
-        "samples": samples_json("sequences", report.names),
-        "units": dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
-        "denominators": _segmentation_counts(report.main),
-        "left_out": left_out_json(report.left_out),
-        "provenance": report.provenance,
-    }
+        metrics=segmentation_scores(report.main) | {"per_class": class_rows_json(rows, report.class_names)},
+        units=dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
+        denominators=_segmentation_counts(report.main),
+    )
 
 
 def _segmentation_counts(metrics: SegmentationMetrics) -> dict[str, int]:
@@ -73,14 +71,14 @@ def motion_json(report: MotionReport, source: str) -> dict[str, Any]:
     unit, tau = report.length_unit, MAIN_TAU[report.protocol]
     rows = {label: _motion_numbers(own, tau) | _motion_counts(own) for label, own in report.classes.items()}
     counts = {"sequences": len(report.names), **_motion_counts(report.main)}
-    return {
-        "task": "motion",
-        "input": source,
-        "protocol": _motion_protocol(report),
-        "metrics": _motion_numbers(report.main, tau) | {"per_class": class_rows_json(rows, report.class_names)},
-        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
-        "samples": samples_json("sequences", report.names),
-        "units": {
+    return report_json(
+        "motion",
+        source,
+        report,
+        "sequences",
+        protocol=_motion_protocol(report),
+        metrics=_motion_numbers(report.main, tau) | {"per_class": class_rows_json(rows, report.class_names)},
+        units={
             "epe3d": unit,
             "epe3d_no_motion": unit,
             **dict.fromkeys(SHARES, "fraction"),
@@ -88,10 +86,8 @@ def motion_json(report: MotionReport, source: str) -> dict[str, Any]:
             "part_rotation": "degree",
             "part_displacement": unit,
         },
-        "denominators": counts | {"pairs_without_truth": report.without_truth},
-        "left_out": left_out_json(report.left_out),
-        "provenance": report.provenance,
-    }
+        denominators=counts | {"pairs_without_truth": report.without_truth},
+    )
 
 
 def _motion_protocol(report: MotionReport) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, means_of_samples
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, means_of_samples
 from dpcli.evaluate.choices import LEARNED_METRICS, PICTURE_METRICS, PICTURE_UNITS, SCENE_METRICS
 from dpcli.evaluate.networks.weights import weights_folder
 from dpcli.evaluate.proportions import mean_defined
@@ -26,7 +26,6 @@ from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.evaluate.video.view_pairing import match_views
 from dpcli.runtime.progress import log
 
-NO_INTERVALS = Resampling(0)
 ROLES = ("reference", "test", "train")
 
 
