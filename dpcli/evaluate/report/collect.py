@@ -198,7 +198,7 @@ def _scores_result(path: Path, truth: Path | None, split: str | None) -> Collect
     from dpcli.evaluate.classification.result_json import classification_json
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
-    return CollectedResult(_through_json(classification_json(report, str(path))), str(path))
+    return _collected(classification_json(report, str(path)), path)
 
 
 def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[CollectedResult]:
@@ -214,12 +214,10 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
         moves = bool((predicted.pair_counts > 0).any())
         posed, flows = (field in clouds.fields and moves for field in ("pose", "scene_flow"))
     options = {"split": split, "resampling": Resampling()}
-    parts = segmentation_json(evaluate_segmentation(path, truth, **options), str(path))
-    made = [CollectedResult(_through_json(parts), str(path))]
+    made = [_collected(segmentation_json(evaluate_segmentation(path, truth, **options), str(path)), path)]
     if posed or flows:
         try:
-            report = evaluate_motion(path, truth, **options)
-            made.append(CollectedResult(_through_json(motion_json(report, str(path))), str(path)))
+            made.append(_collected(motion_json(evaluate_motion(path, truth, **options), str(path)), path))
         except DataError as error:
             if posed:
                 raise
@@ -235,7 +233,7 @@ def _video_result(path: Path, truth: Path | None, pictures: bool) -> CollectedRe
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
-    result = CollectedResult(_through_json(video_json(evaluate_video(path, truth), str(path))), str(path))
+    result = _collected(video_json(evaluate_video(path, truth), str(path)), path)
     if pictures:
         _add_strips(result)
     return result
@@ -260,9 +258,9 @@ def _add_strips(result: CollectedResult) -> None:
         result.notes.append(f"No pictures: {error}.")
 
 
-def _through_json(found: dict[str, Any]) -> dict[str, Any]:
+def _collected(found: dict[str, Any], path: Path) -> CollectedResult:
     """Returns the object as its JSON text would be read, so that files and objects make the same page."""
-    return json.loads(json.dumps(found, allow_nan=False))
+    return CollectedResult(json.loads(json.dumps(found, allow_nan=False)), str(path))
 
 
 def _drop_repeats(results: list[CollectedResult]) -> Collected:
