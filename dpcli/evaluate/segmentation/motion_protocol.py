@@ -171,7 +171,7 @@ def _compare_with_poses(pair: SequencePair, meters: float) -> Iterator[MotionSta
     if truth.part.max() >= truth.pose.shape[1]:
         raise DataError(f"part {truth.part.max()}, but there are poses of {truth.pose.shape[1]} parts")
     for (source, target), motions, flow in zip(parts.pairs.tolist(), parts.motion, parts.flow, strict=True):
-        span = slice(int(truth.frame_offsets[source]), int(truth.frame_offsets[source + 1]))
+        span = pair.span(source)
         points, part, predicted = truth.points[span], truth.part[span], pair.predicted.part[span]
         known = part >= 0
         real = true_motion(truth.pose, source, target)
@@ -182,9 +182,8 @@ def _compare_with_poses(pair: SequencePair, meters: float) -> Iterator[MotionSta
 
 def _compare_with_flow(pair: SequencePair, meters: float) -> Iterator[MotionStatistics]:
     """Compares pairs f -> f + 1 with scene_flow, which every point has."""
-    truth = pair.truth
     for (source, _), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
-        real = truth.scene_flow[int(truth.frame_offsets[source]) : int(truth.frame_offsets[source + 1])]
+        real = pair.truth.scene_flow[pair.span(source)]
         if not np.isfinite(real).all():
             wrong = int((~np.isfinite(real)).any(axis=1).sum())
             raise DataError(f"the true flow of {wrong} of the {len(real)} points of frame {source} is NaN or infinite")

@@ -121,14 +121,12 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
 
 
 def _sequence_values(pair: SequencePair, protocol: str, ignore_below: int) -> dict[str, Any]:
-    offsets = pair.truth.frame_offsets
-    spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    truths = [pair.truth.part[span] for span in spans]
+    truths = [pair.truth.part[span] for span in pair.spans]
     if protocol == "release":
         truths = compressed_over_pairs(truths)
     frames = [
         Frame(ids, pair.predicted.part[span], pair.parts.probability[span])
-        for ids, span in zip(truths, spans, strict=True)
+        for ids, span in zip(truths, pair.spans, strict=True)
     ]
     found = segmentation_update(frames, ignore_below=ignore_below, protocol=protocol)
     return {"label": pair.truth.label, "statistics": vars(found)}

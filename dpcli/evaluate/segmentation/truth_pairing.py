@@ -22,6 +22,15 @@ class SequencePair:
     predicted: CloudSequence
     parts: PartsSample
 
+    def span(self, frame: int) -> slice:
+        """Returns where the points of a frame stand among those of the sequence."""
+        return slice(*self.truth.frame_offsets[frame : frame + 2].tolist())
+
+    @property
+    def spans(self) -> list[slice]:
+        """Returns the span of each frame."""
+        return [self.span(frame) for frame in range(self.truth.num_frames)]
+
 
 class PairedSequences:
     """Gives the sequences of a parts file that count, each beside its truth, in the order of the parts file.
