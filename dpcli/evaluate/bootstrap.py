@@ -19,7 +19,6 @@ from dpcli.runtime.seeds import generator
 WeightedMetric = Callable[[np.ndarray], dict[str, np.ndarray]]
 """Counts f64 (R,n), how often each of n samples counts in each of R resamples -> value f64 (R) by metric, NaN = 0/0."""
 
-METHODS = ("bca", "percentile")
 FEW = 10  # samples below which a bootstrap underestimates how far they may be from others
 TOO_FEW = "Of 95 % intervals of a mean of 4 normal values, 80 % hold the true one; of 10, 89 %."
 _BLOCK = 1 << 21  # counts in memory at once
@@ -50,6 +49,9 @@ class Resampling:
             return {}
         rng = generator(self.seed)
         return bootstrap(metric, samples, rng, resamples=self.resamples, confidence=self.confidence)
+
+
+NO_INTERVALS = Resampling(0)
 
 
 @dataclass(frozen=True)
@@ -126,40 +128,25 @@ def _joined(parts: Iterator[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def bootstrap(
-    metric: WeightedMetric,
-    samples: int,
-    rng: np.random.Generator,
-    *,
-    resamples: int = 2000,
-    confidence: float = 0.95,
-    method: str = "bca",
+    metric: WeightedMetric, samples: int, rng: np.random.Generator, *, resamples: int = 2000, confidence: float = 0.95
 ) -> dict[str, Interval]:
-    """Returns the interval of each metric from resamples of `samples` samples.
+    """Returns the interval of each metric from resamples of `samples` samples: bias-corrected and accelerated (Efron 1987).
 
-    method: "bca", bias-corrected and accelerated (Efron 1987), or "percentile"; ValueError for another. A resample in
-    which a metric is 0/0 doesn't count for it; when most are, or there is one sample only, the interval is undefined.
+    A resample in which a metric is 0/0 doesn't count for it; when most are, or there is one sample only, the interval is
+    undefined.
 
     >>> metric = means_of_samples({"mean": np.arange(10.0)})
     >>> ends = bootstrap(metric, 10, np.random.default_rng(0), resamples=1000)["mean"]
     >>> ends.low < 4.5 < ends.high
     True
     """
-    if method not in METHODS:
-        raise ValueError(f"method {method!r}: expected one of {', '.join(METHODS)}")
     estimate = {key: float(value[0]) for key, value in metric(np.ones((1, samples))).items()}
     if samples < 2:
         return {key: Interval(np.nan, np.nan) for key in estimate}
     found = replicates(metric, samples, rng, resamples)
-    jackknife = left_out_once(metric, samples) if method == "bca" else None
+    jackknife = left_out_once(metric, samples) or {}
     return {
-        key: interval(
-            estimate[key],
-            found[key],
-            confidence,
-            bca=method == "bca",
-            jackknife=None if jackknife is None else jackknife[key],
-        )
-        for key in estimate
+        key: interval(estimate[key], found[key], confidence, bca=True, jackknife=jackknife.get(key)) for key in estimate
     }
 
 

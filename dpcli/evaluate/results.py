@@ -33,6 +33,11 @@ class LeftOut:
     names: list[str]
 
 
+def left_out(names_by_reason: Mapping[str, list[str]]) -> list[LeftOut]:
+    """Returns an entry for each reason for which samples don't count."""
+    return [LeftOut(reason, names) for reason, names in names_by_reason.items() if names]
+
+
 @dataclass(frozen=True)
 class Result:
     """Holds what a command found, in both forms it can be printed in.
@@ -123,6 +128,35 @@ def left_out_json(entries: Sequence[LeftOut]) -> list[dict[str, Any]]:
 def none_if_nan(value: float) -> float | None:
     """Returns the number, or None where it is NaN (undefined): JSON has no NaN."""
     return None if np.isnan(value) else float(value)
+
+
+def report_json(
+    task: str,
+    source: str,
+    report: Any,
+    kind: str,
+    *,
+    protocol: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    units: Mapping[str, str],
+    denominators: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Returns the object of `--json` of a report that holds `names`, `resampling`, `intervals`, `left_out` and `provenance`.
+
+    source: the file, as it was named. kind: what `names` are, and what was resampled.
+    """
+    return {
+        "task": task,
+        "input": source,
+        "protocol": protocol,
+        "metrics": metrics,
+        "intervals": intervals_json(report.resampling, kind, len(report.names), report.intervals),
+        "samples": samples_json(kind, report.names),
+        "units": units,
+        "denominators": denominators,
+        "left_out": left_out_json(report.left_out),
+        "provenance": report.provenance,
+    }
 
 
 def intervals_json(

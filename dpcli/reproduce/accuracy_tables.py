@@ -266,15 +266,27 @@ def prepared(
     return files
 
 
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Adds the options that every network has."""
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--prepare", default="", help="more words for `dpc prepare`")
+    parser.add_argument("--clouds", type=Path, help="a file of clouds to take instead of preparing RAW")
+
+
+def clouds_of(given: argparse.Namespace, experiment: Experiment, run: Dpc) -> Path:
+    """Returns the file of clouds that is named, or the one that RAW makes."""
+    return (
+        given.clouds or prepared(experiment, given.raw, given.folder, ["clouds"], given.prepare.split(), run)["clouds"]
+    )
+
+
 def add_plan(parser: argparse.ArgumentParser) -> None:
     """Adds the options that every accuracy has."""
-    parser.add_argument("--preset", default="quick")
+    add_data(parser)
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument(
         "--clips", type=int, help="per video at prediction, 0 = every start; 8, or 0 for thesis and release"
     )
-    parser.add_argument("--prepare", default="", help="more words for `dpc prepare`")
-    parser.add_argument("--clouds", type=Path, help="a file of clouds to take instead of preparing RAW")
 
 
 def clips_of(preset: str, given: int | None) -> int:

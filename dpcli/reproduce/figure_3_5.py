@@ -22,7 +22,7 @@ import numpy as np
 
 from dpcli.classify.presets import PRESETS
 from dpcli.draw.sheet import save_figure
-from dpcli.reproduce.accuracy_tables import prepared
+from dpcli.reproduce.accuracy_tables import add_data, clouds_of
 from dpcli.reproduce.runs import (
     DASH,
     Dpc,
@@ -272,13 +272,11 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     parser.add_argument("data", choices=list(DATA))
     parser.add_argument("raw", help="the data set's folder; - with --clouds")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--preset", default="quick")
+    add_data(parser)
     parser.add_argument("--folds", type=int, default=10)
     parser.add_argument("--only", default="", help="some of the folds, from 0: 0,1,2")
     parser.add_argument("--sweep", action="append", default=[], help="NAME=values; NAME= leaves a sweep out; repeat")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--prepare", default="", help="more words for `dpc prepare`")
-    parser.add_argument("--clouds", type=Path, help="a file of clouds to take instead of preparing RAW")
     given = parser.parse_args(own)
     experiment, setting = DATA[given.data]
     values = swept(given.sweep)
@@ -287,9 +285,7 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
         parser.error(
             f"--only {given.only}: expected folds from 0 to {given.folds - 1} (--folds {given.folds}), such as 0,1"
         )
-    clouds = (
-        given.clouds or prepared(experiment, given.raw, given.folder, ["clouds"], given.prepare.split(), run)["clouds"]
-    )
+    clouds = clouds_of(given, experiment, run)
     words = ["--preset", given.preset, *setting.words, *budget, "--seed", str(given.seed)]
     values, note = possible(values, given.preset)
     make(clouds, given.folder, words, values, given.folds, only, run, note)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from dpcli import __version__
 from dpcli.draw.sheet import save_figure
-from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, prepared
+from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, clouds_of
 from dpcli.reproduce.runs import (
     DASH,
     Cell,
@@ -293,9 +293,7 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     backbones = given.backbones.split(",")
     if set(backbones) - set(BACKBONES):
         parser.error(f"--backbones {given.backbones}: expected some of {', '.join(BACKBONES)}")
-    clouds = given.clouds
-    if not clouds and not given.profile_only:
-        clouds = prepared(EXPERIMENTS["3.4"], given.raw, given.folder, ["clouds"], given.prepare.split(), run)["clouds"]
+    clouds = given.clouds if given.profile_only else clouds_of(given, EXPERIMENTS["3.4"], run)
     plan = Plan(given.preset, clips_of(given.preset, given.clips), tuple(budget))
     make(clouds, given.folder, plan, numbers(given.seeds), backbones, given.flow, run)
     sys.stdout.write((given.folder / "table.md").read_text())

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, prepared
+from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, clouds_of
 from dpcli.reproduce.runs import (
     DASH,
     Cell,
@@ -154,7 +154,7 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     given = parser.parse_args(own)
     experiment, setting = DATA[given.data]
     folder, plan = given.folder, Plan(given.preset, clips_of(given.preset, given.clips), tuple(budget))
-    clouds = given.clouds or prepared(experiment, given.raw, folder, ["clouds"], given.prepare.split(), run)["clouds"]
+    clouds = clouds_of(given, experiment, run)
     start = None
     if given.modelnet:
         start = pretrained(given.modelnet, folder, given.preset, given.pretrain.split(), run)

@@ -6,6 +6,16 @@ from collections.abc import Callable
 
 import pytest
 
+from dpcli.runtime.run_folder import RunFolder
+
+
+@pytest.fixture(autouse=True, scope="package")
+def no_learning_curves():
+    """No table shows them; a picture takes longer than these trainings."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFolder, "_draw_rest", lambda folder: None)
+        yield
+
 
 @pytest.fixture
 def dpc_told(dpc_here) -> Callable[..., str]:

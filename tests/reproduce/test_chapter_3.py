@@ -285,7 +285,8 @@ def test_sweeps_share_the_static_stream_of_a_fold(clouds, tmp_path):
     assert (tmp_path / "figure.png").read_bytes().startswith(PNG)
 
 
-def test_a_job_trains_its_own_folds_and_shows_everyones(clouds, tmp_path):
+def test_a_job_trains_its_own_folds_and_shows_everyones(clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(figure_3_5, "picture", lambda *_: None)
     words = ["msraction3d", "-", str(tmp_path), "--clouds", str(clouds), "--folds", "3", "--preset", "tiny"]
     words += ["--sweep", "group_size=4,8", *(f"--sweep={key}=" for key in ("reduction", "temporal_radius", "radius"))]
     second, first, everyone = Pretended(), Pretended(), Pretended()
@@ -346,7 +347,8 @@ def test_backbones_and_a_flow_baseline_that_fails(clouds, tmp_path):
     )
 
 
-def test_a_stop_in_the_flow_baseline_is_no_failure(clouds, tmp_path):
+def test_a_stop_in_the_flow_baseline_is_no_failure(clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(figure_3_8, "picture", lambda *_: None)
     asked = Pretended(stop=3)
     with pytest.raises(SystemExit) as ended:
         figure_3_8.main(

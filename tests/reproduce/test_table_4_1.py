@@ -36,7 +36,7 @@ def objects(tmp_path_factory) -> Path:
         "--kinds",
         "laptop,scissors",
         "--objects",
-        4,
+        2,
         "--frames",
         2,
         "--points",
@@ -54,7 +54,7 @@ def objects(tmp_path_factory) -> Path:
 
 def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path, monkeypatch, dpc_told, capfd) -> None:
     monkeypatch.setattr(table_4_1, "dpc", dpc_told)
-    budget = ["--epochs", "1", "--set", "pairs_per_epoch=4", "--batch", "2", "--points", "64"]
+    budget = ["--epochs", "1", "--set", "pairs_per_epoch=2", "--batch", "2", "--points", "64"]
     words = [str(objects), str(objects), str(tmp_path / "t"), "--rows", "past", "--", *budget]
     table_4_1.main(words)
     first = capfd.readouterr().out

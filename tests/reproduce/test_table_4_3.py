@@ -27,7 +27,7 @@ def test_a_toy_table_is_made_once(tmp_path, monkeypatch, dpc_told, capfd):
     for kind, sides in enumerate([(1, 2, 0.6), (3, 1, 1), (0.5, 0.5, 2)]):
         (meshes / f"class{kind % 2}").mkdir(parents=True, exist_ok=True)
         trimesh.creation.box(np.array(sides)).export(meshes / f"class{kind % 2}" / f"box{kind}.obj")
-    words = [folder, "--meshes", meshes, "--rooms", 1, "--points", 128, "--methods", "dbscan,ward"]
+    words = [folder, "--meshes", meshes, "--rooms", 1, "--points", 64, "--methods", "dbscan,ward"]
     main([str(word) for word in words])
     text = (folder / "table.md").read_text()
     assert text in capfd.readouterr().out and text.count("| dbscan |") == text.count("| ward |") == 2

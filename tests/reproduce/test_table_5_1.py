@@ -56,8 +56,8 @@ def test_a_toy_table_is_made_and_running_again_fits_nothing(tmp_path, monkeypatc
     monkeypatch.setattr(runs, "ThreadPoolExecutor", _OneAtATime)
     _box(tmp_path / "meshes" / "boxes" / "Box.glb")
     words = ["table_5_1", str(tmp_path / "t"), "--meshes", str(tmp_path / "meshes"), "--clips", "boxes/Box.glb:0"]
-    words += ["--size", "48", "--frames", "3", "--rows", "flat,prior", "--", "--preset", "tiny"]
-    words += ["--set", "dense_steps=4", "--set", "sparse_steps=4"]
+    words += ["--size", "48", "--frames", "2", "--rows", "flat,prior", "--", "--preset", "tiny"]
+    words += ["--set", "dense_steps=2", "--set", "sparse_steps=2"]
     monkeypatch.setattr(sys, "argv", words)
     table_5_1.main()
     text = (tmp_path / "t" / "table.md").read_text()

@@ -100,14 +100,9 @@ def top_hits(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> np.n
     >>> top_hits(np.array([[0.5, 0.3, 0.2], [0.5, 0.3, 0.2]]), np.array([1, 2]), top_k=2).tolist()
     [True, False]
     """
-    return _true_ranks(scores, labels) < top_k
-
-
-def _true_ranks(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Returns how many classes come before the true one in each row, i64 (S)."""
     own = np.take_along_axis(scores, labels[:, None].astype(np.int64), axis=1)
     before = (scores > own) | ((scores == own) & (np.arange(scores.shape[1]) < labels[:, None]))
-    return before.sum(axis=1)
+    return before.sum(axis=1) < top_k
 
 
 def _check(scores: np.ndarray, labels: np.ndarray) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.classification.calibration import Calibration, are_probabilities, calibrate, calibration_weighted
 from dpcli.evaluate.classification.metrics import (
     ClassificationMetrics,
@@ -19,7 +19,7 @@ from dpcli.evaluate.classification.metrics import (
     predicted_labels,
 )
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
-from dpcli.evaluate.results import LeftOut, counted_split, tell_split
+from dpcli.evaluate.results import LeftOut, counted_split, left_out, tell_split
 from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader
 
@@ -38,14 +38,15 @@ class ClassificationReport:
     split: str
     truth: str
     streams: dict[str, ClassificationMetrics]
-    left_out: list[LeftOut] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    labels: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    scores: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
-    calibration: dict[str, Calibration | None] = field(default_factory=dict)
-    rejected: np.ndarray | None = None  # bool (S), of the samples that count
+    left_out: list[LeftOut]
+    names: list[str]
+    labels: np.ndarray
+    scores: np.ndarray
+    resampling: Resampling
+    intervals: dict[str, dict[str, Interval]]
+    calibration: dict[str, Calibration | None]
+    rejected: np.ndarray | None  # bool (S), of the samples that count
+    provenance: list[dict]
 
     @property
     def accepted(self) -> tuple[int, int] | None:
@@ -67,7 +68,7 @@ def evaluate_classification(
     split: str | None = None,
     *,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
 ) -> ClassificationReport:
     """Returns the metrics of a scores file.
 
@@ -77,13 +78,13 @@ def evaluate_classification(
     Raises DataError when nothing is left, the split doesn't exist, or truth and scores don't hold the same samples
     (with `intersect` those on one side only are left out) and classes.
     """
-    scores, resampling = ScoresReader(path), resampling or Resampling(0)
+    scores = ScoresReader(path)
     if not scores.names:
         raise DataError(f"{path}: holds no samples; predict again")
     found = labels_in_file(scores) if truth is None else match_labels(scores, truth, split, intersect)
     tell_split(truth or path, split, found.splits)
     split = counted_split(split, found.splits)
-    keep, left_out = _choose_samples(scores, found, split)
+    keep, others = _choose_samples(scores, found, split)
     labels = found.labels[keep]
     _tell_first_label(truth or path, scores.scores[keep], labels)
     streams = {name: rows[keep] for name, rows in _streams(scores).items()}
@@ -95,13 +96,14 @@ def evaluate_classification(
             name: classification_metrics(rows, labels, confidence=resampling.confidence)
             for name, rows in streams.items()
         },
-        left_out=left_out,
+        left_out=others,
         names=_names(scores, keep),
         labels=labels,
         scores=scores.scores[keep],
         resampling=resampling,
         intervals={name: resampling.intervals(_metric(rows, labels), len(labels)) for name, rows in streams.items()},
         rejected=None if scores.rejected is None else scores.rejected[keep],
+        provenance=scores.provenance,
         calibration={name: calibrate(rows, labels) for name, rows in streams.items()},
     )
 
@@ -142,12 +144,11 @@ def _choose_samples(scores: ScoresReader, found: TruthLabels, split: str) -> tup
     if not keep.any():
         count = int(of_split.sum())
         raise DataError(f"{scores.path}: {counted(count, 'sample')} without a label; give the truth with --truth FILE")
-    left_out = [
-        *found.left_out,
-        LeftOut(f"not of split {split!r}", _names(scores, found.in_truth & ~of_split)),
-        LeftOut("unknown label (-1)", _names(scores, of_split & ~labeled)),
-    ]
-    return keep, [entry for entry in left_out if entry.names]
+    others = {
+        f"not of split {split!r}": _names(scores, found.in_truth & ~of_split),
+        "unknown label (-1)": _names(scores, of_split & ~labeled),
+    }
+    return keep, [*found.left_out, *left_out(others)]
 
 
 def _names(scores: ScoresReader, chosen: np.ndarray) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from dpcli.evaluate.classification.calibration import BINS, Calibration
@@ -11,10 +10,10 @@ from dpcli.evaluate.classification.protocol import ClassificationReport
 from dpcli.evaluate.results import ends_json, intervals_json, left_out_json, none_if_nan, samples_json
 
 
-def classification_json(report: ClassificationReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def classification_json(report: ClassificationReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
-    source: the scores file, as it was named. provenance: that of the file.
+    source: the scores file, as it was named.
     """
     main = report.main
     name = list(report.streams)[-1]
@@ -46,7 +45,7 @@ def classification_json(report: ClassificationReport, source: str, provenance: S
         },
         "accepted": dict(zip(("samples", "correct"), report.accepted)) if report.accepted else None,
         "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
+        "provenance": report.provenance,
     }
 
 

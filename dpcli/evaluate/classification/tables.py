@@ -6,6 +6,7 @@ from dpcli.counted import counted
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
@@ -87,10 +88,8 @@ def _interval_tables(report: ClassificationReport) -> list[TextTable]:
     if not report.resampling.resamples:
         return []
     top = f"top{report.main.top_k}_accuracy"
-    titles = {top: f"top-{report.main.top_k}", "balanced_accuracy": "balanced accuracy", "macro_f1": "macro F1"}
-    titles["calibration_error"] = "calibration error"
-    if report.main.top_accuracy is None:
-        titles.pop(top)
+    titles = {top: f"top-{report.main.top_k}"} if report.main.top_accuracy is not None else {}
+    titles |= {key: title_of(key) for key in ("balanced_accuracy", "macro_f1", "calibration_error")}
     rows = [
         [title, *(percent_ends(own.get(key)) for own in report.intervals.values())] for key, title in titles.items()
     ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import REORDER, DataError
-from dpcli.evaluate.results import LeftOut, counted_split, list_names
+from dpcli.evaluate.results import LeftOut, counted_split, left_out, list_names
 from dpcli.store import CloudsReader, ScoresReader
 
 
@@ -58,8 +58,8 @@ def match_labels(scores: ScoresReader, truth: str | Path, split: str | None, int
             f"{truth}: label {labels[worst]} of {scores.names[worst]!r}; "
             f"{scores.path} has the classes 0..{len(scores.class_names) - 1}"
         )
-    left_out = [LeftOut("the truth doesn't have", unknown), LeftOut("not scored", unscored)]
-    return TruthLabels(labels, [splits[row] for row in rows], in_truth, left_out)
+    one_sided = left_out({"the truth doesn't have": unknown, "not scored": unscored})
+    return TruthLabels(labels, [splits[row] for row in rows], in_truth, one_sided)
 
 
 def _check_names(

@@ -9,7 +9,7 @@ from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.classification.result_json import classification_json
 from dpcli.evaluate.classification.tables import classification_notes, classification_tables
 from dpcli.evaluate.results import Result
-from dpcli.store import ScoresReader, input_file
+from dpcli.store import input_file
 
 
 def run_classification(
@@ -31,5 +31,5 @@ def run_classification(
             from dpcli.evaluate.classification.confusion_picture import draw_confusion_matrix
 
             draw_confusion_matrix(report, picture)
-        data = classification_json(report, scores, ScoresReader(path).provenance)
+        data = classification_json(report, scores)
     return Result(data, classification_tables(report), classification_notes(report))

@@ -9,7 +9,6 @@ from dpcli.evaluate.results import Result
 from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
 from dpcli.evaluate.segmentation.motion_tables import motion_notes, motion_tables
 from dpcli.evaluate.segmentation.result_json import motion_json
-from dpcli.evaluate.segmentation.sequence_pass import made_by
 from dpcli.store import input_file
 
 
@@ -24,5 +23,5 @@ def run_motion(parts: str, truth: Path | None, *, picture: Path | None = None, *
             from dpcli.evaluate.segmentation.class_bars import draw_motion_bars
 
             draw_motion_bars(report, picture)
-        data = motion_json(report, parts, made_by(path))
+        data = motion_json(report, parts)
     return Result(data, motion_tables(report), motion_notes(report))

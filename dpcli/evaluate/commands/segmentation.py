@@ -8,7 +8,6 @@ from typing import Any
 from dpcli.evaluate.results import Result
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.result_json import segmentation_json
-from dpcli.evaluate.segmentation.sequence_pass import made_by
 from dpcli.evaluate.segmentation.tables import segmentation_notes, segmentation_tables
 from dpcli.store import input_file
 
@@ -24,5 +23,5 @@ def run_segmentation(parts: str, truth: Path | None, *, picture: Path | None = N
             from dpcli.evaluate.segmentation.class_bars import draw_segmentation_bars
 
             draw_segmentation_bars(report, picture)
-        data = segmentation_json(report, parts, made_by(path))
+        data = segmentation_json(report, parts)
     return Result(data, segmentation_tables(report), segmentation_notes(report))

@@ -17,7 +17,7 @@ def run_segments(source: str, truth: Path, *, intersect: bool, resampling: Resam
     text = _piped() if source == "-" else None
     predicted = read_segments("stdin" if source == "-" else source, text)
     report = evaluate_segments(predicted, read_segments(truth), str(truth), intersect=intersect, resampling=resampling)
-    data = segments_json(report, source, predicted.provenance)
+    data = segments_json(report, source)
     return Result(data, segments_tables(report), segments_notes(report))
 
 

@@ -45,10 +45,14 @@ class FileMetrics:
     must_equal: Mapping[str, object] = field(default_factory=dict)
     must_equal_by_sample: Mapping[str, Sequence[object]] = field(default_factory=dict)
     left_out: list[LeftOut] = field(default_factory=list)
-    seed: int | None = None
     provenance: list[dict] = field(default_factory=list)
     correct: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def seed(self) -> int | None:
+        """Returns the seed of the training behind the file; None where nothing says it."""
+        return history_seed(self.provenance)
 
     def values(self) -> dict[str, float]:
         """Returns the metrics of all samples together; NaN = undefined."""

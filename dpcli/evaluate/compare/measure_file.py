@@ -13,14 +13,12 @@ from dpcli.evaluate.bootstrap import WeightedMetric
 from dpcli.evaluate.choices import CLASSIFICATION_METRICS, MOTION_METRICS, SEGMENTATION_METRICS, TOP_K, VIDEO_METRICS
 from dpcli.evaluate.classification.metrics import classification_weighted, predicted_labels, top_hits
 from dpcli.evaluate.classification.protocol import evaluate_classification
-from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed, metrics_of_values
+from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, metrics_of_values
 from dpcli.evaluate.results import KEPT_STATISTICS
-from dpcli.evaluate.segmentation.metrics import segmentation_weighted
-from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, motion_weighted
-from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
-from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+from dpcli.evaluate.segmentation.motion_protocol import MotionReport, evaluate_motion
+from dpcli.evaluate.segmentation.protocol import SegmentationReport, evaluate_segmentation
 from dpcli.evaluate.video.sources.open_source import is_media
-from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+from dpcli.store import CloudsReader, PartsReader, file_kind
 
 # metrics that are no mean over views can't be compared view by view
 _VIDEO_METRICS = tuple(
@@ -94,7 +92,6 @@ def _measure_scores(path: Path, source: str, options: EvaluationOptions) -> File
     asked = [name for name in options.metrics or CLASSIFICATION_METRICS if name not in absent]
     if not asked:
         raise UsageError(f"{source}: top-{TOP_K} accuracy of {len(report.class_names)} classes is always 1")
-    provenance = ScoresReader(path).provenance
     return FileMetrics(
         source,
         "classification",
@@ -106,8 +103,7 @@ def _measure_scores(path: Path, source: str, options: EvaluationOptions) -> File
         {"split": report.split, "class names": report.class_names},
         {"true label": report.labels.tolist()},
         report.left_out,
-        history_seed(provenance),
-        provenance,
+        report.provenance,
         correct,
     )
 
@@ -121,45 +117,37 @@ def _measure_segmentation(path: Path, source: str, options: EvaluationOptions, a
         split=options.split,
         intersect=options.intersect,
     )
-    metric = segmentation_weighted(report.sequences, options.protocol)
-    provenance = _parts_provenance(path)
-    return FileMetrics(
-        source,
-        "segmentation",
-        "sequences",
-        report.names,
-        metric,
-        _values_of_single_samples(metric, len(report.names), asked),
-        dict.fromkeys(asked, "fraction"),
-        {"split": report.split},
-        {},
-        report.left_out,
-        history_seed(provenance),
-        provenance,
-    )
+    return _of_sequences(report, source, "segmentation", dict.fromkeys(asked, "fraction"), {})
 
 
 def _measure_motion(path: Path, source: str, options: EvaluationOptions, asked: Sequence[str]) -> FileMetrics:
     report = evaluate_motion(
         path, options.truth, protocol=options.protocol, split=options.split, intersect=options.intersect
     )
-    batch = RELEASE_BATCH if options.protocol == "release" else None
-    metric = motion_weighted(report.statistics, MAIN_TAU[options.protocol], batch)
-    units = {"epe3d": report.length_unit, "part_rotation": "degree", "part_displacement": report.length_unit}
-    provenance = _parts_provenance(path)
+    lengths = {"epe3d": report.length_unit, "part_rotation": "degree", "part_displacement": report.length_unit}
+    units = {name: lengths.get(name, "fraction") for name in asked}
+    return _of_sequences(report, source, "motion", units, {"frame pairs": [pairs.tolist() for pairs in report.pairs]})
+
+
+def _of_sequences(
+    report: SegmentationReport | MotionReport,
+    source: str,
+    task: str,
+    units: dict[str, str],
+    must_equal_by_sample: dict[str, list],
+) -> FileMetrics:
     return FileMetrics(
         source,
-        "motion",
+        task,
         "sequences",
         report.names,
-        metric,
-        _values_of_single_samples(metric, len(report.names), asked),
-        {name: units.get(name, "fraction") for name in asked},
+        report.metric,
+        _values_of_single_samples(report.metric, len(report.names), units),
+        units,
         {"split": report.split},
-        {"frame pairs": [pairs.tolist() for pairs in report.pairs]},
+        must_equal_by_sample,
         report.left_out,
-        history_seed(provenance),
-        provenance,
+        report.provenance,
     )
 
 
@@ -182,8 +170,7 @@ def _measure_video(path: Path, source: str, options: EvaluationOptions) -> FileM
     values, units = view_values(report)
     protocol = {"protocol": describe_protocol(report.protocol)}
     found = metrics_of_values(source, values, units, protocol)
-    history, notes = report.history, report.notes
-    return replace(found, left_out=report.left_out, seed=history_seed(history), provenance=history, notes=notes)
+    return replace(found, left_out=report.left_out, provenance=report.provenance, notes=report.notes)
 
 
 def _values_of_single_samples(metric: WeightedMetric, samples: int, asked: Sequence[str]) -> dict[str, np.ndarray]:
@@ -193,8 +180,3 @@ def _values_of_single_samples(metric: WeightedMetric, samples: int, asked: Seque
         rows = np.arange(start, min(start + _ROWS, samples))
         blocks.append(metric((rows[:, None] == np.arange(samples)).astype(np.float64)))
     return {key: np.concatenate([block[key] for block in blocks]) for key in asked}
-
-
-def _parts_provenance(path: Path) -> list[dict]:
-    with PartsReader(path) as reader:
-        return reader.provenance

@@ -19,7 +19,7 @@ from dpcli.evaluate.choices import LOWER_IS_BETTER
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics
 from dpcli.evaluate.compare.measure_file import kind_of_file, measure_file
 from dpcli.evaluate.compare.significance_tests import McNemar, mcnemar, wilcoxon_signed_rank
-from dpcli.evaluate.results import LeftOut, list_names
+from dpcli.evaluate.results import LeftOut, left_out, list_names
 from dpcli.runtime.seeds import generator
 
 MOST_CHANGED = 10  # samples named
@@ -134,7 +134,7 @@ def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, inte
     (with `intersect` the common ones are compared and the rest listed).
     """
     _check_facts(a, b)
-    a, b, left_out = _common_samples(a, b, intersect)
+    a, b, others = _common_samples(a, b, intersect)
     rng, keys, found = generator(resampling.seed), list(a.units), {}
     if resampling.resamples and len(a.names) > 1:
         found = replicates(lambda counts: _differences(a, b, counts), len(a.names), rng, resampling.resamples)
@@ -142,9 +142,7 @@ def pair_metrics(a: FileMetrics, b: FileMetrics, resampling: Resampling, *, inte
     changes = {key: _change(key, a, b, (ours[key], theirs[key]), found.get(key), resampling) for key in keys}
     by = next((key for key in ("accuracy", "miou", "epe3d", *keys) if key in a.per_sample and key in keys), "")
     values = (a.per_sample[by], b.per_sample[by]) if by else (np.zeros(0), np.zeros(0))
-    return Paired(
-        a.task, a.kind, a.names, changes, by, _most_changed(a.names, *values), _mcnemar(a, b), values, left_out
-    )
+    return Paired(a.task, a.kind, a.names, changes, by, _most_changed(a.names, *values), _mcnemar(a, b), values, others)
 
 
 def _differences(a: FileMetrics, b: FileMetrics, counts: np.ndarray) -> dict[str, np.ndarray]:
@@ -190,11 +188,12 @@ def _common_samples(a: FileMetrics, b: FileMetrics, intersect: bool) -> tuple[Fi
         LeftOut(entry.reason, [name for name in entry.names if name not in one_sided])
         for entry in (*a.left_out, *b.left_out)
     ]
-    left_out = [*_without_repeats(told), LeftOut(f"only in {a.source}", only_a), LeftOut(f"only in {b.source}", only_b)]
+    others = [entry for entry in _without_repeats(told) if entry.names]
+    others += left_out({f"only in {a.source}": only_a, f"only in {b.source}": only_b})
     a, b = a.restricted(common), b.restricted(common)
     for what in a.must_equal_by_sample:
         _check_facts_of_samples(a, b, what)
-    return a, b, [entry for entry in left_out if entry.names]
+    return a, b, others
 
 
 def _without_repeats(entries: Sequence[LeftOut]) -> list[LeftOut]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric, ratios_of_sums
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric, ratios_of_sums
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
 from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
 from dpcli.evaluate.proportions import divide
@@ -49,8 +49,9 @@ class JointReport:
     total: JointStatistics
     counts: dict[int, JointStatistics]
     resampling: Resampling
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    poses: bool = True
+    intervals: dict[str, Interval]
+    poses: bool
+    provenance: list[dict]
 
 
 def evaluate_joints(
@@ -59,14 +60,13 @@ def evaluate_joints(
     *,
     split: str | None = None,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
 ) -> JointReport:
     """Returns the metrics of the joints that a parts file holds against those of a clouds file.
 
     Raises DataError where one of the files has no joints, or no true joint is left to compare; other arguments and errors
     are those of `PairedSequences`.
     """
-    resampling = resampling or Resampling(0)
     names, labels, found = [], [], []
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=("part", "joint")) as paired:
         if "joint" not in paired.predicted.fields:
@@ -96,6 +96,7 @@ def evaluate_joints(
         resampling,
         resampling.intervals(_weighted(found), len(found)),
         "pose" in paired.truth.fields,
+        paired.predicted.provenance,
     )
 
 

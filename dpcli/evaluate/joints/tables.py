@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from dpcli.counted import counted
 from dpcli.evaluate.joints.metrics import JointStatistics
 from dpcli.evaluate.joints.protocol import METRICS, JointReport
 from dpcli.evaluate.joints.visibility import VISIBLE
-from dpcli.evaluate.results import (
-    class_rows_json,
-    intervals_json,
-    left_out_json,
-    left_out_note,
-    none_if_nan,
-    samples_json,
-)
+from dpcli.evaluate.results import class_rows_json, left_out_note, none_if_nan, report_json
 from dpcli.evaluate.segmentation.part_matching import IOU_THRESHOLD
 from dpcli.evaluate.segmentation.tables import class_rows, interval_tables
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
@@ -84,32 +76,30 @@ def joint_notes(report: JointReport) -> list[str]:
     ]
 
 
-def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def joint_json(report: JointReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
-    source: the parts file, as it was named. provenance: that of the file.
+    source: the parts file, as it was named.
     """
     unit = report.length_unit
     rows = {label: _numbers(own) | _counts(report.counts[label]) for label, own in report.classes.items()}
     units = {**dict.fromkeys(_SHARES, "fraction"), "axis_angle": "degree", "axis_position": unit}
-    return {
-        "task": "joints",
-        "input": source,
-        "protocol": {
+    return report_json(
+        "joints",
+        source,
+        report,
+        "sequences",
+        protocol={
             "split": report.split,
             "truth": report.truth,
             "iou_threshold": IOU_THRESHOLD,
             "axis_within": 5,
             "visible": VISIBLE,
         },
-        "metrics": _numbers(report.metrics) | {"per_class": class_rows_json(rows, report.class_names)},
-        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
-        "samples": samples_json("sequences", report.names),
-        "units": units | {"state_angle": "degree", "state_length": unit},
-        "denominators": {"sequences": len(report.names), **_counts(report.total)},
-        "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
-    }
+        metrics=_numbers(report.metrics) | {"per_class": class_rows_json(rows, report.class_names)},
+        units=units | {"state_angle": "degree", "state_length": unit},
+        denominators={"sequences": len(report.names), **_counts(report.total)},
+    )
 
 
 def _numbers(metrics: dict[str, float]) -> dict[str, float | None]:

@@ -14,7 +14,7 @@ from dpcli.evaluate.report.error_clouds import part_blocks
 from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.evaluate.results import KEPT_STATISTICS
 from dpcli.evaluate.video.sources.open_source import is_media
-from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+from dpcli.store import CloudsReader, PartsReader, file_kind
 from dpcli.store.file import MAGIC, is_hdf5
 from dpcli.store.pipes import standard_input
 from dpcli.text_files import distinct_keys
@@ -198,9 +198,7 @@ def _scores_result(path: Path, truth: Path | None, split: str | None) -> Collect
     from dpcli.evaluate.classification.result_json import classification_json
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
-    return CollectedResult(
-        _through_json(classification_json(report, str(path), ScoresReader(path).provenance)), str(path)
-    )
+    return _collected(classification_json(report, str(path)), path)
 
 
 def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[CollectedResult]:
@@ -213,19 +211,13 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
     with CloudsReader(truth) as clouds, PartsReader(path) as predicted:
-        moves, provenance = bool((predicted.pair_counts > 0).any()), predicted.provenance
+        moves = bool((predicted.pair_counts > 0).any())
         posed, flows = (field in clouds.fields and moves for field in ("pose", "scene_flow"))
     options = {"split": split, "resampling": Resampling()}
-    made = [
-        CollectedResult(
-            _through_json(segmentation_json(evaluate_segmentation(path, truth, **options), str(path), provenance)),
-            str(path),
-        )
-    ]
+    made = [_collected(segmentation_json(evaluate_segmentation(path, truth, **options), str(path)), path)]
     if posed or flows:
         try:
-            report = evaluate_motion(path, truth, **options)
-            made.append(CollectedResult(_through_json(motion_json(report, str(path), provenance)), str(path)))
+            made.append(_collected(motion_json(evaluate_motion(path, truth, **options), str(path)), path))
         except DataError as error:
             if posed:
                 raise
@@ -241,7 +233,7 @@ def _video_result(path: Path, truth: Path | None, pictures: bool) -> CollectedRe
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
-    result = CollectedResult(_through_json(video_json(evaluate_video(path, truth), str(path))), str(path))
+    result = _collected(video_json(evaluate_video(path, truth), str(path)), path)
     if pictures:
         _add_strips(result)
     return result
@@ -266,9 +258,9 @@ def _add_strips(result: CollectedResult) -> None:
         result.notes.append(f"No pictures: {error}.")
 
 
-def _through_json(found: dict[str, Any]) -> dict[str, Any]:
+def _collected(found: dict[str, Any], path: Path) -> CollectedResult:
     """Returns the object as its JSON text would be read, so that files and objects make the same page."""
-    return json.loads(json.dumps(found, allow_nan=False))
+    return CollectedResult(json.loads(json.dumps(found, allow_nan=False)), str(path))
 
 
 def _drop_repeats(results: list[CollectedResult]) -> Collected:

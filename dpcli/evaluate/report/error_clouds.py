@@ -75,20 +75,15 @@ def part_blocks(path: Path, truth: Path, *, split: str | None = None, motion: bo
 
 
 def _sequence_error(place: int, pair: SequencePair, motion: bool) -> SequenceError:
-    offsets, truth, predicted = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
-    spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    ious = [mean_iou(truth[span], predicted[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
-    errors = []
-    if motion:
-        for (source, target), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
-            errors.append(mean_defined(_flow_error(pair, source, target, flow)))
+    ious = [mean_iou(pair.truth.part[span], pair.predicted.part[span]) for span in pair.spans]
+    pairs = zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True) if motion else ()
+    errors = [mean_defined(_flow_error(pair, *frames, flow)) for frames, flow in pairs]
     return SequenceError(place, pair.truth.name, np.array(ious), np.array(errors))
 
 
 def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) -> np.ndarray:
     """Returns the end-point error f64 (N) of the points of a frame, NaN without a true part."""
-    truth = pair.truth
-    span = slice(int(truth.frame_offsets[source]), int(truth.frame_offsets[source + 1]))
+    truth, span = pair.truth, pair.span(source)
     points, part = truth.points[span], truth.part[span]
     real = true_flow(points, np.maximum(part, 0), true_motion(truth.pose, source, target))
     return np.where(part >= 0, np.linalg.norm(flow - real, axis=1), np.nan)
@@ -108,8 +103,7 @@ def _read_cloud(paired: PairedSequences, own: SequenceError, frame: int) -> Clou
     Where poses are read and a pair begins at the frame, the error is that of its flow.
     """
     pair = paired.pair(own.place)
-    truth, unit = pair.truth, None
-    span = slice(int(truth.frame_offsets[frame]), int(truth.frame_offsets[frame + 1]))
+    truth, span, unit = pair.truth, pair.span(frame), None
     part = _rename_parts(truth.part[span], pair.predicted.part[span])
     error = np.where(truth.part[span] >= 0, (part != truth.part[span]).astype(np.float64), np.nan)
     from_frame = np.flatnonzero(pair.parts.pairs[:, 0] == frame)

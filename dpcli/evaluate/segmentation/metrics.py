@@ -13,7 +13,6 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
-from dpcli.evaluate.choices import PARTS_PROTOCOLS
 from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.average_precision import RankedPredictions, average_precision
@@ -86,9 +85,9 @@ def segmentation_update(
     """Returns the statistics of one object, given its frames. True parts of fewer than `ignore_below` points are ignored.
 
     Frames without a true part that counts are skipped; protocol `release` (see `match_parts`, `mean_iou`) can't skip
-    them and raises DataError. Raises ValueError for another protocol.
+    them and raises DataError.
     """
-    options = {"ignore_below": ignore_below, "release": _is_release(protocol)}
+    options = {"ignore_below": ignore_below, "release": protocol == "release"}
     matches: list[FrameMatch] = []
     ious, rands, adjusted, skipped, present, unknown = [], [], [], 0, 0, 0
     for number, frame in enumerate(frames):
@@ -116,12 +115,6 @@ def segmentation_update(
     return SegmentationStatistics(*joined, *means, parts, len(matches), skipped, present - len(joined[0]), unknown)
 
 
-def _is_release(protocol: str) -> bool:
-    if protocol not in PARTS_PROTOCOLS:
-        raise ValueError(f"protocol {protocol!r}: expected one of {', '.join(PARTS_PROTOCOLS)}")
-    return protocol == "release"
-
-
 def part_scores(
     true_positives: np.ndarray,
     predictions: np.ndarray,
@@ -137,7 +130,7 @@ def part_scores(
     >>> {key: round(float(value), 3) for key, value in part_scores(2, 3, 1.7, 2).items()}
     {'pq': 0.68, 'f1': 0.8, 'pre': 0.667, 'rec': 1.0}
     """
-    release = _is_release(protocol)
+    release = protocol == "release"
     ratio = _floored_ratio if release else divide
     precision, recall = ratio(true_positives, predictions), ratio(true_positives, truth_parts)
     return {
@@ -155,7 +148,7 @@ def _floored_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
 
 
 def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dpc") -> SegmentationMetrics:
-    """Returns the metrics that statistics stand for. Raises ValueError for an unknown protocol.
+    """Returns the metrics that statistics stand for.
 
     `release` keeps the order of the predictions where confidences are equal (`dpc` counts them together), and takes 0/0
     as 0 (see `part_scores`).
@@ -164,7 +157,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
     hits, count = int(matched.sum()), len(matched)
     scores = part_scores(hits, count, float(statistics.iou[matched].sum()), truth, protocol)
     return SegmentationMetrics(
-        ap=average_precision(statistics.confidence, matched, truth, keep_order=_is_release(protocol)),
+        ap=average_precision(statistics.confidence, matched, truth, keep_order=protocol == "release"),
         **{key: float(value) for key, value in scores.items()},
         miou=mean_defined(statistics.object_iou),
         ri=mean_defined(statistics.object_rand),
@@ -183,7 +176,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
 def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol: str = "dpc") -> WeightedMetric:
     """Returns ap, pq, f1, pre, rec, miou, ri and ari as functions of how often each sequence counts.
 
-    sequences: the statistics of each one. Raises ValueError for an unknown protocol.
+    sequences: the statistics of each one.
     """
     whole = merge_statistics(sequences)
     sequence = np.repeat(np.arange(len(sequences)), [len(one.iou) for one in sequences])
@@ -193,7 +186,7 @@ def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol:
     truth_parts = [one.truth_parts for one in sequences]
     sums = np.stack([hits, predictions, iou, truth_parts], axis=1).astype(np.float64)
     over_sequences = means_of_samples({"miou": whole.object_iou, "ri": whole.object_rand, "ari": whole.object_adjusted})
-    ranked = RankedPredictions(whole.confidence, whole.matched, sequence, keep_order=_is_release(protocol))
+    ranked = RankedPredictions(whole.confidence, whole.matched, sequence, keep_order=protocol == "release")
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
         totals = (counts @ sums).T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
+from dpcli.evaluate.results import LeftOut, left_out, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import (
     MAIN_TAU,
     RELEASE_BATCH,
@@ -41,9 +41,9 @@ from dpcli.store.schema import METERS
 class MotionReport:
     """Holds the metrics of all sequences, and of those of each label that occurs.
 
-    names, statistics, pairs: each sequence that counts, its statistics and frame pairs i (Q,2). intervals: by metric
-    (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true flow
-    is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
+    names, pairs: each sequence that counts and its frame pairs i (Q,2). metric: of how often each counts. intervals: by
+    metric (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true
+    flow is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
     """
 
     protocol: str
@@ -54,14 +54,14 @@ class MotionReport:
     classes: dict[int, MotionMetrics]
     class_names: list[str]
     left_out: list[LeftOut]
-    sequences: int
-    names: list[str] = field(default_factory=list)
-    statistics: list[MotionStatistics] = field(default_factory=list)
-    pairs: list[np.ndarray] = field(default_factory=list)
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    from_poses: bool = True
-    without_truth: int = 0
+    names: list[str]
+    pairs: list[np.ndarray]
+    metric: WeightedMetric
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    from_poses: bool
+    without_truth: int
+    provenance: list[dict]
 
 
 def evaluate_motion(
@@ -71,7 +71,7 @@ def evaluate_motion(
     protocol: str = "dpc",
     split: str | None = None,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
     keeping: Keeping = NOT_KEPT,
 ) -> MotionReport:
     """Returns the metrics of all frame pairs of a parts file against the `part` and `pose` of a clouds file.
@@ -95,7 +95,7 @@ def evaluate_motion(
             meters = METERS.get(paired.truth.length_unit, 1.0)
             measure = partial(_sequence_values, from_poses=from_poses, truth=str(truth), meters=meters)
             counted = count_sequences(paired, measure, about, keeping)
-    return _make_report(counted, path, resampling or Resampling(0))
+    return _make_report(counted, path, resampling)
 
 
 def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> MotionReport:
@@ -118,15 +118,15 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
             [row["label"] for _, row in found], statistics, lambda own: motion_compute(merge_statistics(own), batch)
         ),
         counted.class_names,
-        [*counted.left_out, *([LeftOut(reason, without_pairs)] if without_pairs else [])],
-        len(statistics),
+        [*counted.left_out, *left_out({reason: without_pairs})],
         [name for name, _ in found],
-        statistics,
         [row["pairs"] for _, row in found],
+        metric,
         resampling,
         resampling.intervals(metric, len(statistics)),
         from_poses,
         without_truth,
+        counted.provenance,
     )
 
 
@@ -171,7 +171,7 @@ def _compare_with_poses(pair: SequencePair, meters: float) -> Iterator[MotionSta
     if truth.part.max() >= truth.pose.shape[1]:
         raise DataError(f"part {truth.part.max()}, but there are poses of {truth.pose.shape[1]} parts")
     for (source, target), motions, flow in zip(parts.pairs.tolist(), parts.motion, parts.flow, strict=True):
-        span = slice(int(truth.frame_offsets[source]), int(truth.frame_offsets[source + 1]))
+        span = pair.span(source)
         points, part, predicted = truth.points[span], truth.part[span], pair.predicted.part[span]
         known = part >= 0
         real = true_motion(truth.pose, source, target)
@@ -182,9 +182,8 @@ def _compare_with_poses(pair: SequencePair, meters: float) -> Iterator[MotionSta
 
 def _compare_with_flow(pair: SequencePair, meters: float) -> Iterator[MotionStatistics]:
     """Compares pairs f -> f + 1 with scene_flow, which every point has."""
-    truth = pair.truth
     for (source, _), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
-        real = truth.scene_flow[int(truth.frame_offsets[source]) : int(truth.frame_offsets[source + 1])]
+        real = pair.truth.scene_flow[pair.span(source)]
         if not np.isfinite(real).all():
             wrong = int((~np.isfinite(real)).any(axis=1).sum())
             raise DataError(f"the true flow of {wrong} of the {len(real)} points of frame {source} is NaN or infinite")

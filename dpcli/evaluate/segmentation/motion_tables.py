@@ -70,7 +70,7 @@ def motion_notes(report: MotionReport) -> list[str]:
         else "over all points"
     )
     lines = [
-        f"Split {report.split!r}, truth: {report.truth}. {counted(main.pairs, 'frame pair')} of {counted(report.sequences, 'sequence')}; "
+        f"Split {report.split!r}, truth: {report.truth}. {counted(main.pairs, 'frame pair')} of {counted(len(report.names), 'sequence')}; "
         f"means {how}. no motion: EPE3D of predicting none.",
         "At tau: AccS error < tau or 5 %, AccR < 2 tau or 10 %, Outlier > 6 tau or 10 % of the true flow. The published "
         "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05. Unit of tau: "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
 from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
@@ -45,7 +45,7 @@ FIXES = (
 class SegmentationReport:
     """Holds the metrics of all sequences, and of those of each label that occurs; `objects` has what pictures need.
 
-    names, sequences: each sequence that counts and its statistics; intervals: by metric, empty without `resampling`.
+    names: the sequences that count. metric: of how often each counts. intervals: by metric, empty without `resampling`.
     """
 
     protocol: str
@@ -57,10 +57,11 @@ class SegmentationReport:
     classes: dict[int, SegmentationMetrics]
     class_names: list[str]
     left_out: list[LeftOut]
-    names: list[str] = field(default_factory=list)
-    sequences: list[SegmentationStatistics] = field(default_factory=list)
-    resampling: Resampling = field(default_factory=lambda: Resampling(0))
-    intervals: dict[str, Interval] = field(default_factory=dict)
+    names: list[str]
+    metric: WeightedMetric
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    provenance: list[dict]
 
 
 def evaluate_segmentation(
@@ -71,7 +72,7 @@ def evaluate_segmentation(
     ignore_below: int = 0,
     split: str | None = None,
     intersect: bool = False,
-    resampling: Resampling | None = None,
+    resampling: Resampling = NO_INTERVALS,
     keeping: Keeping = NOT_KEPT,
 ) -> SegmentationReport:
     """Returns the metrics of a parts file against the `part` of a clouds file, over all frames of all sequences that count.
@@ -89,7 +90,7 @@ def evaluate_segmentation(
             about = {"task": "segmentation", "protocol": protocol, "ignore_below": ignore_below}
             measure = partial(_sequence_values, protocol=protocol, ignore_below=ignore_below)
             counted = count_sequences(paired, measure, about, keeping)
-    return _make_report(counted, path, resampling or Resampling(0))
+    return _make_report(counted, path, resampling)
 
 
 def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> SegmentationReport:
@@ -100,6 +101,7 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
     if whole.frames == 0:
         of_size = f" of at least {ignore_below} points" if ignore_below else ""
         raise DataError(f"{about['truth']}: not one frame has a true part{of_size}")
+    metric = segmentation_weighted(sequences, protocol)
     return SegmentationReport(
         protocol,
         ignore_below,
@@ -111,21 +113,20 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
         counted.class_names,
         counted.left_out,
         counted.names,
-        sequences,
+        metric,
         resampling,
-        resampling.intervals(segmentation_weighted(sequences, protocol), len(sequences)),
+        resampling.intervals(metric, len(sequences)),
+        counted.provenance,
     )
 
 
 def _sequence_values(pair: SequencePair, protocol: str, ignore_below: int) -> dict[str, Any]:
-    offsets = pair.truth.frame_offsets
-    spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    truths = [pair.truth.part[span] for span in spans]
+    truths = [pair.truth.part[span] for span in pair.spans]
     if protocol == "release":
         truths = compressed_over_pairs(truths)
     frames = [
         Frame(ids, pair.predicted.part[span], pair.parts.probability[span])
-        for ids, span in zip(truths, spans, strict=True)
+        for ids, span in zip(truths, pair.spans, strict=True)
     ]
     found = segmentation_update(frames, ignore_below=ignore_below, protocol=protocol)
     return {"label": pair.truth.label, "statistics": vars(found)}

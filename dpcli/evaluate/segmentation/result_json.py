@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from dpcli.evaluate.choices import SEGMENTATION_METRICS
-from dpcli.evaluate.results import class_rows_json, intervals_json, left_out_json, none_if_nan, samples_json
+from dpcli.evaluate.results import class_rows_json, none_if_nan, report_json
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, SHARES, TAUS, MotionMetrics, tau_unit
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
@@ -22,16 +21,18 @@ def segmentation_scores(metrics: SegmentationMetrics) -> dict[str, float | None]
     return {key: none_if_nan(getattr(metrics, key)) for key in SEGMENTATION_METRICS}
 
 
-def segmentation_json(report: SegmentationReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def segmentation_json(report: SegmentationReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
-    source: the parts file, as it was named. provenance: that of the file.
+    source: the parts file, as it was named.
     """
     rows = {label: segmentation_scores(own) | _segmentation_counts(own) for label, own in report.classes.items()}
-    return {
-        "task": "segmentation",
-        "input": source,
-        "protocol": {
+    return report_json(
+        "segmentation",
+        source,
+        report,
+        "sequences",
+        protocol={
             "name": report.protocol,
             "split": report.split,
             "truth": report.truth,
@@ -41,14 +42,10 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
             "ap_pq_f1_pre_rec": "pooled over all frames of all sequences",
             "miou_ri": "mean over the frames of a sequence, then over sequences",
         },
-        "metrics": segmentation_scores(report.main) | {"per_class": class_rows_json(rows, report.class_names)},
-        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
-        "samples": samples_json("sequences", report.names),
-        "units": dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
-        "denominators": _segmentation_counts(report.main),
-        "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
-    }
+        metrics=segmentation_scores(report.main) | {"per_class": class_rows_json(rows, report.class_names)},
+        units=dict.fromkeys(SEGMENTATION_METRICS, "fraction"),
+        denominators=_segmentation_counts(report.main),
+    )
 
 
 def _segmentation_counts(metrics: SegmentationMetrics) -> dict[str, int]:
@@ -65,23 +62,23 @@ def _segmentation_counts(metrics: SegmentationMetrics) -> dict[str, int]:
     }
 
 
-def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+def motion_json(report: MotionReport, source: str) -> dict[str, Any]:
     """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
 
     accs, accr, outlier are those of the protocol's own tau; `thresholds` has both. source: the parts file, as it was
-    named. provenance: that of the file.
+    named.
     """
     unit, tau = report.length_unit, MAIN_TAU[report.protocol]
     rows = {label: _motion_numbers(own, tau) | _motion_counts(own) for label, own in report.classes.items()}
-    counts = {"sequences": report.sequences, **_motion_counts(report.main)}
-    return {
-        "task": "motion",
-        "input": source,
-        "protocol": _motion_protocol(report),
-        "metrics": _motion_numbers(report.main, tau) | {"per_class": class_rows_json(rows, report.class_names)},
-        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
-        "samples": samples_json("sequences", report.names),
-        "units": {
+    counts = {"sequences": len(report.names), **_motion_counts(report.main)}
+    return report_json(
+        "motion",
+        source,
+        report,
+        "sequences",
+        protocol=_motion_protocol(report),
+        metrics=_motion_numbers(report.main, tau) | {"per_class": class_rows_json(rows, report.class_names)},
+        units={
             "epe3d": unit,
             "epe3d_no_motion": unit,
             **dict.fromkeys(SHARES, "fraction"),
@@ -89,10 +86,8 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
             "part_rotation": "degree",
             "part_displacement": unit,
         },
-        "denominators": counts | {"pairs_without_truth": report.without_truth},
-        "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
-    }
+        denominators=counts | {"pairs_without_truth": report.without_truth},
+    )
 
 
 def _motion_protocol(report: MotionReport) -> dict[str, Any]:

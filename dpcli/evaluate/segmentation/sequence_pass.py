@@ -11,11 +11,10 @@ from typing import Any, TypeVar
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
-from dpcli.runtime import provenance
 from dpcli.runtime.machines.shards import describe_shard
 from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.progress import log
-from dpcli.store import PartsReader
+from dpcli.runtime.provenance import record
 from dpcli.store.file import file_kind
 from dpcli.store.statistics import StatisticsReader, StatisticsWriter
 from dpcli.store.writing.already_made import WORK, already_made
@@ -47,9 +46,13 @@ NOT_KEPT = Keeping()
 
 @dataclass(frozen=True)
 class Counted:
-    """Holds what was counted: the evaluation's choices and facts, and for each sequence its name and values."""
+    """Holds what was counted: the evaluation's choices and facts, and for each sequence its name and values.
+
+    provenance: that of the parts file.
+    """
 
     about: dict[str, Any]
+    provenance: list[dict[str, Any]]
     class_names: list[str]
     length_unit: str
     names: list[str]
@@ -113,7 +116,7 @@ def count_sequences(paired: PairedSequences, measure: Measure, about: dict[str, 
         left_out = [[entry.reason, entry.names] for entry in paired.left_out]
         about = {**about, "split": paired.split, "truth": str(paired.truth.path), "left_out": left_out}
         inputs = {"parts": paired.predicted.path, "truth": paired.truth.path} if kept else None
-        entry = describe_shard(provenance.record(about, 0, inputs), keeping.spread.shard)
+        entry = describe_shard(record(about, 0, inputs), keeping.spread.shard)
         if not kept or keeping.force or not already_made(target, entry, StatisticsReader, WORK):
             with StatisticsWriter(
                 target,
@@ -143,14 +146,8 @@ def _run(paired: PairedSequences, measure: Measure, writer: StatisticsWriter, sp
 def _counted(reader: StatisticsReader) -> Counted:
     for line in skipped_lines(reader.skipped):
         log.warn(line)
-    about = reader.provenance[-1]["config"]
+    *provenance, own = reader.provenance
+    about = own["config"]
     about["left_out"] = [*about["left_out"], *([reason, [name]] for name, reason in reader.skipped)]
     rows = [reader.read(index) for index in range(len(reader.names))]
-    return Counted(about, reader.class_names, reader.length_unit, reader.names, rows)
-
-
-def made_by(path: str | Path) -> list[dict[str, Any]]:
-    """Returns the commands that led to a parts file, or to the parts file that statistics were counted in."""
-    if file_kind(path) == "statistics":
-        return StatisticsReader(path).provenance[:-1]
-    return PartsReader(path).provenance
+    return Counted(about, provenance, reader.class_names, reader.length_unit, reader.names, rows)

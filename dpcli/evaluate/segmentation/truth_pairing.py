@@ -10,7 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.results import LeftOut, counted_split, list_names, tell_split
+from dpcli.evaluate.results import LeftOut, counted_split, left_out, list_names, tell_split
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
 
 
@@ -21,6 +21,15 @@ class SequencePair:
     truth: CloudSequence
     predicted: CloudSequence
     parts: PartsSample
+
+    def span(self, frame: int) -> slice:
+        """Returns where the points of a frame stand among those of the sequence."""
+        return slice(*self.truth.frame_offsets[frame : frame + 2].tolist())
+
+    @property
+    def spans(self) -> list[slice]:
+        """Returns the span of each frame."""
+        return [self.span(frame) for frame in range(self.truth.num_frames)]
 
 
 class PairedSequences:
@@ -55,8 +64,7 @@ class PairedSequences:
         self._check_unit()
         tell_split(truth, split, self.truth.splits)
         self.split = counted_split(split, self.truth.splits)
-        self.left_out: list[LeftOut] = []
-        self.rows = self._match_names(intersect)
+        self.rows, self.left_out = self._match_names(intersect)
 
     def _check_unit(self) -> None:
         """Raises DataError for two units; one that a file doesn't name may be any."""
@@ -67,8 +75,8 @@ class PairedSequences:
                 "predict again from that file"
             )
 
-    def _match_names(self, intersect: bool) -> list[tuple[int, int]]:
-        """Returns (index in the parts file, index in the truth) of what counts."""
+    def _match_names(self, intersect: bool) -> tuple[list[tuple[int, int]], list[LeftOut]]:
+        """Returns (index in the parts file, index in the truth) of what counts, and what doesn't."""
         row_of = {name: index for index, name in enumerate(self.truth.names)}
         names = self.predicted.names
         unknown = [name for name in names if name not in row_of]
@@ -80,16 +88,19 @@ class PairedSequences:
         if not intersect:
             self._check_names(unknown, not_predicted)
         counted = set(of_split)
-        self._leave_out("the truth doesn't have", unknown)
-        self._leave_out("not predicted", not_predicted)
-        self._leave_out(f"not of split {self.split!r}", [n for n in names if n in row_of and n not in counted])
         rows = [(index, row_of[name]) for index, name in enumerate(names) if name in counted]
         if not rows:
             raise DataError(
                 f"{self.predicted.path}: no sequence of split {self.split!r} of {self.truth.path}; "
                 "--split all takes every one"
             )
-        return rows
+        return rows, left_out(
+            {
+                "the truth doesn't have": unknown,
+                "not predicted": not_predicted,
+                f"not of split {self.split!r}": [n for n in names if n in row_of and n not in counted],
+            }
+        )
 
     def _check_names(self, unknown: list[str], not_predicted: list[str]) -> None:
         if unknown:
@@ -102,10 +113,6 @@ class PairedSequences:
                 f"{self.predicted.path}: has no {list_names(not_predicted)} of split {self.split!r} of "
                 f"{self.truth.path}; predict them too, or --intersect compares what both have"
             )
-
-    def _leave_out(self, reason: str, names: list[str]) -> None:
-        if names:
-            self.left_out.append(LeftOut(reason, names))
 
     def pair(self, place: int) -> SequencePair:
         """Returns the sequence at a place of `rows`. DataError at the first point in which the two files differ."""

@@ -10,17 +10,9 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling
 from dpcli.evaluate.metric_titles import title_of
-from dpcli.evaluate.results import (
-    LeftOut,
-    intervals_json,
-    left_out_json,
-    left_out_note,
-    list_names,
-    none_if_nan,
-    samples_json,
-)
+from dpcli.evaluate.results import LeftOut, left_out, left_out_note, list_names, none_if_nan, report_json
 from dpcli.evaluate.segments.metrics import METRICS, OVERLAPS, RecordingCounts, count_recording, segments_weighted
 from dpcli.evaluate.segments.truth_check import check_classes, doubts_of_frames
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
@@ -45,28 +37,29 @@ class SegmentsReport:
     resampling: Resampling
     truth: str
     left_out: list[LeftOut]
+    provenance: list[dict]
 
 
 def evaluate_segments(
-    predicted: Segments, true: Segments, truth: str, *, intersect: bool = False, resampling: Resampling | None = None
+    predicted: Segments, true: Segments, truth: str, *, intersect: bool = False, resampling: Resampling = NO_INTERVALS
 ) -> SegmentsReport:
     """Returns the metrics of the recordings that both have. truth: the true table as it was named.
 
     Raises DataError where one side lacks a recording, unless `intersect`, or where no class of the prediction is in the truth.
     """
-    resampling = resampling or Resampling(0)
     names = [name for name in true.recordings if name in predicted.recordings]
-    left_out = _left_out(predicted, true, names, truth, intersect)
+    others = _one_sided(predicted, true, names, truth, intersect)
     check_classes(predicted, true, names, truth)
     for doubt in doubts_of_frames(predicted, true, names):
         log.warn(f"{truth}: {doubt}")
     counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
     metric = segments_weighted(counts)
     values = {key: float(value[0]) for key, value in metric(np.ones((1, len(counts)))).items()}
-    return SegmentsReport(names, counts, values, resampling.intervals(metric, len(counts)), resampling, truth, left_out)
+    intervals = resampling.intervals(metric, len(counts))
+    return SegmentsReport(names, counts, values, intervals, resampling, truth, others, predicted.provenance)
 
 
-def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: str, intersect: bool) -> list[LeftOut]:
+def _one_sided(predicted: Segments, true: Segments, names: Sequence[str], truth: str, intersect: bool) -> list[LeftOut]:
     unknown = [name for name in predicted.recordings if name not in true.recordings]
     missing = [name for name in true.recordings if name not in predicted.recordings]
     if not names:
@@ -77,8 +70,7 @@ def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: 
         raise DataError(
             f"{truth}: {side} {list_names(lacking)}; {empty}--intersect evaluates the recordings that both have"
         )
-    entries = [LeftOut("the truth doesn't have", unknown), LeftOut("not predicted", missing)]
-    return [entry for entry in entries if entry.names]
+    return left_out({"the truth doesn't have": unknown, "not predicted": missing})
 
 
 def segments_tables(report: SegmentsReport) -> list[TextTable]:
@@ -108,27 +100,25 @@ def segments_notes(report: SegmentsReport) -> list[str]:
     ]
 
 
-def segments_json(report: SegmentsReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
-    """Returns the report as `--json` prints it. source: the predicted table, as it was named; provenance: its own."""
+def segments_json(report: SegmentsReport, source: str) -> dict[str, Any]:
+    """Returns the report as `--json` prints it. source: the predicted table, as it was named."""
     counts = report.counts
     rows = [
         {"name": name, "frames": one.frames, "right": one.right, "true": one.true, "predicted": one.predicted}
         for name, one in zip(report.names, counts)
     ]
-    return {
-        "task": "segments",
-        "input": source,
-        "protocol": {"truth": report.truth, "overlaps": list(OVERLAPS), "definition": _NOTE},
-        "metrics": {key: none_if_nan(report.metrics[key]) for key in METRICS} | {"per_recording": rows},
-        "intervals": intervals_json(report.resampling, "recordings", len(counts), report.intervals),
-        "samples": samples_json("recordings", report.names),
-        "units": dict.fromkeys(METRICS, "fraction"),
-        "denominators": {
+    return report_json(
+        "segments",
+        source,
+        report,
+        "recordings",
+        protocol={"truth": report.truth, "overlaps": list(OVERLAPS), "definition": _NOTE},
+        metrics={key: none_if_nan(report.metrics[key]) for key in METRICS} | {"per_recording": rows},
+        units=dict.fromkeys(METRICS, "fraction"),
+        denominators={
             "recordings": len(counts),
             "frames": sum(one.frames for one in counts),
             "true_segments": sum(one.true for one in counts),
             "predicted_segments": sum(one.predicted for one in counts),
         },
-        "left_out": left_out_json(report.left_out),
-        "provenance": list(provenance),
-    }
+    )

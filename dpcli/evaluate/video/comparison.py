@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling, means_of_samples
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, means_of_samples
 from dpcli.evaluate.choices import LEARNED_METRICS, PICTURE_METRICS, PICTURE_UNITS, SCENE_METRICS
 from dpcli.evaluate.networks.weights import weights_folder
 from dpcli.evaluate.proportions import mean_defined
@@ -26,7 +26,6 @@ from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.evaluate.video.view_pairing import match_views
 from dpcli.runtime.progress import log
 
-NO_INTERVALS = Resampling(0)
 ROLES = ("reference", "test", "train")
 
 
@@ -49,7 +48,7 @@ class VideoReport:
     missing: dict[str, str] = field(default_factory=dict)
     scene: dict[str, Any] = field(default_factory=dict)
     length_unit: str = ""
-    history: list[dict] = field(default_factory=list)
+    provenance: list[dict] = field(default_factory=list)
     resampling: Resampling = NO_INTERVALS
     intervals: dict[str, Interval] = field(default_factory=dict)
 
@@ -113,7 +112,7 @@ def evaluate_video(
             missing,
             _scene_scores(predicted, real, names, seed),
             real.header.length_unit if real.header else "",
-            list(predicted.history),
+            list(predicted.provenance),
             resampling,
         )
         report.intervals = _intervals(report)

@@ -39,7 +39,7 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
         "left_out": left_out_json(report.left_out),
         "not_computed": report.missing,
         "notes": report.notes,
-        "provenance": report.history,
+        "provenance": report.provenance,
     }
 
 

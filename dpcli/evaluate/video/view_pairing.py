@@ -6,7 +6,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.results import LeftOut, list_names
+from dpcli.evaluate.results import LeftOut, left_out, list_names
 from dpcli.evaluate.video.protocol import VideoProtocol
 from dpcli.evaluate.video.sources.source import Source
 from dpcli.evaluate.video.sources.stored import SceneSource
@@ -15,11 +15,11 @@ _SAME_CAMERA = 1e-4  # relative: cameras that went through float32 still are the
 
 
 def match_views(
-    predicted: Source, truth: Source, protocol: VideoProtocol, intersect: bool, left_out: list[LeftOut]
+    predicted: Source, truth: Source, protocol: VideoProtocol, intersect: bool, others: list[LeftOut]
 ) -> list[tuple[int, int]]:
     """Returns (view of the prediction, view of the truth) of what is compared, in the truth's order.
 
-    The protocol says which views of the truth; the others of either side go to `left_out`. Raises DataError when one lacks a
+    The protocol says which views of the truth; those of either side that aren't go to `others`. Raises DataError when one lacks a
     partner and `intersect` is off, or none has.
     """
     compared = [i for i, view in enumerate(truth.views) if protocol.views in ("all", view.role)]
@@ -46,11 +46,7 @@ def match_views(
         raise DataError(
             f"{truth.path}: has no view {list_names(unknown)}, which {predicted.path} has; --intersect compares what both have"
         )
-    left_out += [
-        LeftOut(reason, names)
-        for reason, names in (("views not predicted", not_predicted), ("views the truth doesn't have", unknown))
-        if names
-    ]
+    others += left_out({"views not predicted": not_predicted, "views the truth doesn't have": unknown})
     pairs = [(partners[i], i) for i in compared if partners[i] is not None]
     if not pairs:
         raise DataError(

@@ -10,11 +10,12 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
+from dpcli.cli.evaluate.app import ROOM
 from dpcli.cli.evaluate.options import word_option
 from dpcli.cli.option_groups import with_option_groups
 from dpcli.errors import UsageError
 from tests.support.commands import exit_code
+from tests.support.evaluating import evaluate
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,12 @@ def test_wrong_values_end_before_the_command(run) -> None:
 )
 def test_wrong_words_end_before_a_file_is_opened(words, message) -> None:
     with pytest.raises(UsageError, match=message):
-        raise CliRunner().invoke(evaluate.ROOM.application(), words).exception
+        evaluate(*words, raising=True)
 
 
 def test_every_option_is_described_in_a_whole_phrase() -> None:
     """A help begins with a capital letter, and says more than a word."""
-    for command in evaluate.ROOM.application().registered_commands:
+    for command in ROOM.application().registered_commands:
         for name, one in inspect.signature(command.callback, eval_str=True).parameters.items():
             (info,) = [own for own in one.annotation.__metadata__ if hasattr(own, "help")]
             assert info.help and len(info.help.split()) > 1, (command.callback.__name__, name)

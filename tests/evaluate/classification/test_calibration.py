@@ -7,11 +7,10 @@ import json
 import numpy as np
 import pytest
 from sklearn.calibration import calibration_curve
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.evaluate.classification.calibration import are_probabilities, calibrate, calibration_weighted
 from dpcli.store import ScoresWriter
+from tests.support.evaluating import evaluate
 
 
 def case(seed: int, samples: int = 300, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +81,7 @@ def test_the_command_tells_it_in_every_form(tmp_path, probabilities):
             writer.write(f"v{i}", row if probabilities else 7 * row, label=int(label), split="test")
 
     def run(*words):
-        return CliRunner().invoke(evaluate.ROOM.application(), ["classification", str(path), *words])
+        return evaluate("classification", path, *words)
 
     found = json.loads(run("--json").stdout)
     text = run("--picture", str(tmp_path / "p.png"), "--resamples", "200").stdout

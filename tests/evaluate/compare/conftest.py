@@ -1,37 +1,22 @@
-"""The files that comparisons and runs are tested with, and both commands in an application of their own."""
+"""The files that comparisons and runs are tested with, and the commands."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate.compare import compare
-from dpcli.cli.evaluate.runs import runs
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
 from tests.support.scores_helpers import write_scores
 
 
-@pytest.fixture(scope="module")
-def app() -> typer.Typer:
-    own = typer.Typer()
-    own.command()(compare)
-    own.command()(runs)
-    return own
-
-
-@pytest.fixture
-def run(app):
-    def call(*arguments: object) -> str:
-        result = CliRunner().invoke(app, [str(a) for a in arguments])
-        if result.exception is not None:
-            raise result.exception
-        return result.stdout
-
-    return call
+@pytest.fixture(scope="session")
+def run() -> Callable[..., str]:
+    """`dpc evaluate` with these words; it prints, or the test gets what it raises."""
+    return lambda *words: evaluate(*words, raising=True).stdout
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError
 from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.store import CloudSequence, CloudsWriter
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import truth_sequence, write_truth
 from tests.support.scores_helpers import CLASSES, write_scores
 
@@ -40,15 +39,12 @@ def test_another_length_unit_is_an_error(task, parts, tmp_path):
     truth = write_truth(
         tmp_path / "mm.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit="mm"
     )
-    result = CliRunner().invoke(evaluate.ROOM.application(), [task, str(parts["good"]), "--truth", str(truth)])
+    result = evaluate(task, parts["good"], "--truth", truth)
     assert isinstance(result.exception, DataError) and "length_unit 'm', but 'mm' in" in str(result.exception)
     unnamed = write_truth(
         tmp_path / "none.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit=""
     )
-    assert (
-        CliRunner().invoke(evaluate.ROOM.application(), [task, str(parts["good"]), "--truth", str(unnamed)]).exit_code
-        == 0
-    )
+    assert evaluate(task, parts["good"], "--truth", unnamed).exit_code == 0
 
 
 def damaged(source: Path, target: Path, change) -> Path:
@@ -111,7 +107,7 @@ def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words
     bad = damaged(source, tmp_path / "bad.h5", change)
     task = "classification" if what == "scores" else "motion"
     given = {"scores": [bad], "parts": [bad, "--truth", parts["truth"]], "truth": [parts["good"], "--truth", bad]}[what]
-    result = CliRunner().invoke(evaluate.ROOM.application(), [task, *map(str, given)])
+    result = evaluate(task, *given)
     assert isinstance(result.exception, DataError), result.exception
     calls = [str(result.exception)]
     for command in (["compare", given[0], *given], ["runs", *given]):

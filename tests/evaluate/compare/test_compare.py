@@ -10,9 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import rankdata
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Resampling, bootstrap, means_of_samples
 from dpcli.evaluate.classification.protocol import evaluate_classification
@@ -25,8 +23,16 @@ from dpcli.evaluate.compare.significance_tests import mcnemar
 from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.text_tables import resampling_note
 from dpcli.store import PartsReader, PartsWriter, ScoresWriter
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scores_helpers import CLASSES, write_scores
+
+
+@pytest.fixture(scope="module")
+def differences(run, parts) -> dict:
+    """Those of the good prediction and its twin, by metric."""
+    words = ("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--json")
+    return json.loads(run(*words))["metrics"]
 
 
 def test_identical_files_do_not_differ(run, scores, parts):
@@ -39,39 +45,34 @@ def test_identical_files_do_not_differ(run, scores, parts):
         assert not any(found["most_changed"].values())
 
 
-def test_a_broken_twin_is_clearly_worse(run, scores, parts):
+def test_a_broken_twin_is_clearly_worse(run, scores, differences):
     found = json.loads(run("compare", scores["good"], scores["shuffled"], "--json"))
     assert all(
         own["difference"] > 0 and own["p"] < 0.01 and own["interval"][0] > 0 for own in found["metrics"].values()
     )
     assert found["mcnemar"]["p"] < 1e-4
-    found = json.loads(run("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--json"))["metrics"]
     for key in ("miou", "ap", "ri", "accs"):
-        assert found[key]["difference"] > 0 and found[key]["p"] < 0.01 and found[key]["a_better"] == 8, key
-        assert found[key]["wilcoxon_p"] == pytest.approx(2 / 2**8)  # all eight on one side
-    assert found["epe3d"]["difference"] < 0 and found["epe3d"]["a_better"] == 8  # lower is better
-    assert found["part_rotation"]["interval"] is not None
+        own = differences[key]
+        assert own["difference"] > 0 and own["p"] < 0.01 and own["a_better"] == 8, key
+        assert own["wilcoxon_p"] == pytest.approx(2 / 2**8)  # all eight on one side
+    assert differences["epe3d"]["difference"] < 0 and differences["epe3d"]["a_better"] == 8  # lower is better
+    assert differences["part_rotation"]["interval"] is not None
 
 
-def test_numbers_are_those_of_the_single_commands(run, parts, scores):
-    found = json.loads(run("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--json"))["metrics"]
+def test_numbers_are_those_of_the_single_commands(run, parts, scores, differences):
     for task in ("segmentation", "motion"):
         for side, name in (("a", "good"), ("b", "twin")):
-            result = CliRunner().invoke(
-                evaluate.ROOM.application(),
-                [task, str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
-            )
+            result = evaluate(task, parts[name], "--truth", parts["truth"], "--json", "--resamples", 0)
             for key, value in json.loads(result.stdout)["metrics"].items():
-                if key in found:
-                    assert found[key][side] == pytest.approx(value, abs=1e-12), key
+                if key in differences:
+                    assert differences[key][side] == pytest.approx(value, abs=1e-12), key
     found = json.loads(run("compare", scores["good"], scores["close"], "--json"))["metrics"]
     assert found["accuracy"]["a"] == evaluate_classification(scores["good"]).main.accuracy
     assert found["macro_f1"]["b"] == pytest.approx(evaluate_classification(scores["close"]).main.macro_f1)
 
 
-@pytest.mark.parametrize("protocol", ["dpc", "release"])
-def test_swapping_the_files_turns_the_signs(run, parts, protocol):
-    options = ("--truth", parts["truth"], "--json", "--protocol", protocol, "--resamples", 200)
+def test_swapping_the_files_turns_the_signs(run, parts):
+    options = ("--truth", parts["truth"], "--json", "--protocol", "release", "--resamples", 100)
     one, other = (
         json.loads(run("compare", parts[a], parts[b], *options))["metrics"]
         for a, b in (("good", "twin"), ("twin", "good"))
@@ -223,7 +224,7 @@ def test_other_samples_are_named_or_left_out(run, scores, parts, tmp_path):
     assert [(e["count"], e["names"][0]) for e in found["left_out"]] == [(5, "v0"), (3, "v60")]
     with pytest.raises(DataError, match="not one of their samples in common"):
         run("compare", scores["good"], write_scores(tmp_path / "far.h5", set(), start=100), "--intersect")
-    options = ("--truth", parts["truth"])
+    options = ("--truth", parts["truth"], "--resamples", 0)
     with pytest.raises(DataError, match="fewer.h5: has no 's0', 's1' of split"):
         run("compare", parts["good"], parts["fewer"], *options)
     found = json.loads(run("compare", parts["fewer"], parts["good"], *options, "--intersect", "--json"))
@@ -233,7 +234,7 @@ def test_other_samples_are_named_or_left_out(run, scores, parts, tmp_path):
 
 
 def test_what_cannot_be_compared(run, scores, parts, tmp_path):
-    truth = ("--truth", parts["truth"])
+    truth = ("--truth", parts["truth"], "--resamples", 0)
     with pytest.raises(DataError, match="number 1 is 'push' in .* 'pull' in"):
         run("compare", scores["good"], write_scores(tmp_path / "names.h5", set(), class_names=("wave", "pull", "push")))
     with pytest.raises(DataError, match="2 classes|3 in .*, 4 in"):
@@ -292,6 +293,6 @@ def test_few_samples_are_said_to_make_intervals_too_narrow(run, parts, tmp_path)
     covered, rng = 0, np.random.default_rng(0)
     for _ in range(300):
         metric = means_of_samples({"mean": rng.normal(size=4)})
-        ends = bootstrap(metric, 4, rng, resamples=300)["mean"]
+        ends = bootstrap(metric, 4, rng, resamples=200)["mean"]
         covered += ends.low <= 0 <= ends.high
     assert 0.75 < covered / 300 < 0.85  # as the sentence says

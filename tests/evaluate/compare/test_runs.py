@@ -8,9 +8,7 @@ import math
 import h5py
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.classification.protocol import evaluate_classification
 from dpcli.evaluate.classification.result_json import classification_json
@@ -18,6 +16,7 @@ from dpcli.evaluate.compare.runs import mean_with_t_interval
 from dpcli.evaluate.report import collect
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.sequence_pass import Keeping
+from tests.support.evaluating import evaluate
 from tests.support.scores_helpers import write_scores
 
 
@@ -60,12 +59,7 @@ def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):
     names = ("good", "twin")
     direct = json.loads(run("runs", *(parts[name] for name in names), "--truth", parts["truth"], "--json"))
     lines = [
-        CliRunner()
-        .invoke(
-            evaluate.ROOM.application(),
-            ["segmentation", str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
-        )
-        .stdout
+        evaluate("segmentation", parts[name], "--truth", parts["truth"], "--json", "--resamples", 0).stdout
         for name in names
     ]
     (tmp_path / "both.json").write_text("".join(lines))
@@ -89,16 +83,8 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         run("runs", scores["good"], scores["close"], scores["good"])
     with pytest.raises(DataError, match="fewer.h5: has no 's0'"):
         run("runs", parts["good"], parts["fewer"], "--truth", parts["truth"])
-    objects = {}
-    for protocol in ("dpc", "release"):
-        objects[protocol] = (
-            CliRunner()
-            .invoke(
-                evaluate.ROOM.application(),
-                ["segmentation", str(parts["good"]), "--truth", str(parts["truth"]), "--json", "--protocol", protocol],
-            )
-            .stdout
-        )
+    words = ("segmentation", parts["good"], "--truth", parts["truth"], "--json", "--resamples", 0, "--protocol")
+    objects = {protocol: evaluate(*words, protocol).stdout for protocol in ("dpc", "release")}
     path = tmp_path / "mixed.json"
     path.write_text(objects["dpc"] + objects["release"])
     with pytest.raises(DataError, match="mixed.json:2: another protocol than .*name 'release', not 'dpc'"):
@@ -176,10 +162,7 @@ def test_what_is_left_out_of_runs_is_counted(run, tmp_path):
         return str(path)
 
     both = [unlabeled("a", 3, seed=0), unlabeled("b", 3, seed=1)]
-    lines = [
-        CliRunner().invoke(evaluate.ROOM.application(), ["classification", path, "--json", "--resamples", "0"]).stdout
-        for path in both
-    ]
+    lines = [evaluate("classification", path, "--json", "--resamples", 0).stdout for path in both]
     (tmp_path / "both.json").write_text("".join(lines))
     told = "All runs: Left out, unknown label (-1): 1 sample (v3)."
     for files in (both, [tmp_path / "both.json"]):

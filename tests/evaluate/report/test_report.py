@@ -7,17 +7,15 @@ import os
 import re
 import shutil
 import subprocess
+from functools import partial
 from html.parser import HTMLParser
 from io import BytesIO
 
 import numpy as np
 import pytest
-import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate.report import report as report_command
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.classification.protocol import evaluate_classification
@@ -28,6 +26,7 @@ from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud,
 from dpcli.evaluate.report.markdown_and_latex import escape_latex
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
 from tests.support.report_helpers import EVIL
 
@@ -111,11 +110,8 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
     from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.classification.protocol import evaluate_classification
     from dpcli.evaluate.classification.result_json import classification_json
-    from dpcli.store import ScoresReader
 
-    found = classification_json(
-        evaluate_classification(scores, resampling=Resampling()), str(scores), ScoresReader(scores).provenance
-    )
+    found = classification_json(evaluate_classification(scores, resampling=Resampling()), str(scores))
     (folder / "one.json").write_text(json.dumps(found))
     direct, printed = (arrange(collect([str(own)])) for own in (scores, folder / "one.json"))
     assert report_html(direct) == report_html(printed)
@@ -428,10 +424,7 @@ def test_a_video_has_its_pictures_in_the_page(tmp_path):
 
 
 def test_the_command(scores, tmp_path):
-    app = typer.Typer()
-    app.command()(report_command)
-    app.command("other")(lambda: None)  # two commands: the name is needed
-    run = lambda *args: CliRunner().invoke(app, ["report", *map(str, args)])  # noqa: E731
+    run = partial(evaluate, "report")
     page = tmp_path / "r.html"
     assert run(scores, "-o", page, "--title", "T").exit_code == 0 and "<title>T</title>" in page.read_text("utf-8")
     assert isinstance(run(scores, "-o", page).exception, UsageError)  # exists

@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
-from typer.testing import CliRunner
 
-from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
@@ -27,6 +25,7 @@ from dpcli.evaluate.segmentation.metrics import (
 from dpcli.evaluate.segmentation.part_matching import match_parts, mean_iou
 from dpcli.evaluate.segmentation.protocol import compressed_over_pairs, evaluate_segmentation
 from dpcli.evaluate.segmentation.rand_index import rand_index
+from tests.support.evaluating import evaluate
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 TOLERANCE = 1e-6
@@ -286,23 +285,28 @@ def test_published_ids_are_counted_over_a_pair_of_frames():
 # ---- the protocol on files, and the command ----
 
 
-@pytest.fixture
-def truths() -> list:
+def objects() -> list:
     return [truth_sequence(f"s{i}", seed=i, label=i % 2, split="train" if i == 3 else "test") for i in range(4)]
 
 
 @pytest.fixture
-def files(tmp_path, truths) -> tuple[Path, Path]:
+def truths() -> list:
+    return objects()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> tuple[Path, Path]:
     """Truth of three test objects and one of training; the first predicted perfectly, the others as one part."""
+    folder, truths = tmp_path_factory.mktemp("files"), objects()
     samples = [perfect(truth, 4, slots=np.array([2, 0, 3, 1])) for truth in truths[:3]]
     for sequence, probability, *_ in samples[1:]:
         sequence.part[:] = 0
         probability[:] = [0.7, 0.1, 0.1, 0.1]
-    return write_parts(tmp_path / "parts.h5", samples), write_truth(tmp_path / "truth.h5", truths)
+    return write_parts(folder / "parts.h5", samples), write_truth(folder / "truth.h5", truths)
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, ["evaluate", "segmentation", *(str(a) for a in arguments)])
+    return evaluate("segmentation", *arguments)
 
 
 def test_json_says_numbers_units_and_denominators(files):
@@ -381,8 +385,8 @@ def test_small_true_parts_can_be_ignored(files):
 
 def test_a_pipe_gives_the_same(files):
     parts, truth = files
-    words = ["evaluate", "segmentation", "-", "--truth", str(truth), "--json"]
-    found = json.loads(CliRunner().invoke(app, words, input=parts.read_bytes()).stdout)
+    piped = evaluate("segmentation", "-", "--truth", truth, "--json", stdin=parts.read_bytes())
+    found = json.loads(piped.stdout)
     assert found["metrics"] == json.loads(run(parts, "--truth", truth, "--json").stdout)["metrics"]
 
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from dpcli.cli.app import main
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError
 from dpcli.evaluate.segments.metrics import count_recording, segments_weighted
 from dpcli.store.tables.segments import Segment, Segments, read_segments, segments_text
+from tests.support.evaluating import evaluate
 
 CLASSES = ["", "bow", "clap", "wave"]
 LABELS = st.lists(st.integers(0, 3), min_size=1, max_size=24)
@@ -98,7 +97,7 @@ def table(path, rows: str) -> str:
 
 
 def run(*words: str):
-    return CliRunner().invoke(evaluate.ROOM.application(), ["segments", *words])
+    return evaluate("segments", *words)
 
 
 def test_the_command_compares_tables_in_any_form_and_order(tmp_path):

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import parse_video_metrics
 from dpcli.evaluate.report import arrange, collect
@@ -21,13 +19,14 @@ from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 from tests.support.commands import told
+from tests.support.evaluating import evaluate
 from tests.support.picture_metrics import psnr, ssim, ssim_reference
 from tests.support.scenes import toy_scene
 from tests.support.video_clips import FRAMES, HEIGHT, ROLES, WIDTH, clip, header, white, write, write_folder
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(evaluate.ROOM.application(), ["video", *(str(a) for a in arguments)])
+    return evaluate("video", *arguments)
 
 
 def numbers(report: VideoReport, name: str) -> list[float]:
@@ -260,19 +259,17 @@ def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path, tmp_
 
 def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path: Path) -> None:
     worse = write(tmp_path / "worse.h5", clip(2, noise=12))
-    command = ["compare", str(said), str(worse), "--truth", str(truth), "--metrics", "psnr,ssim", "--json"]
-    found = json.loads(CliRunner().invoke(evaluate.ROOM.application(), command).stdout)
+    command = ["compare", said, worse, "--truth", truth, "--metrics", "psnr,ssim", "--json"]
+    found = json.loads(evaluate(*command).stdout)
     expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
     change = found["metrics"]["psnr"]
     assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
     with pytest.raises(UsageError, match="--metrics fvd: protocol disco takes it of all views at once"):
         pooled = [*command[:5], "--metrics", "psnr,fvd", "--protocol", "disco"]
-        raise CliRunner().invoke(evaluate.ROOM.application(), pooled).exception
+        evaluate(*pooled, raising=True)
     with pytest.raises(UsageError, match="a video holds no truth"):
-        raise CliRunner().invoke(evaluate.ROOM.application(), ["compare", str(said), str(worse)]).exception
-    runs = CliRunner().invoke(
-        evaluate.ROOM.application(), ["runs", str(said), str(worse), "--truth", str(truth), "--json"]
-    )
+        evaluate("compare", said, worse, raising=True)
+    runs = evaluate("runs", said, worse, "--truth", truth, "--json")
     assert json.loads(runs.stdout)["metrics"]["psnr"]["mean"] == pytest.approx(np.mean(expected))
 
 
@@ -290,17 +287,17 @@ def test_what_a_video_is_said_to_be_compared_as_is_said_of_two_and_of_many(tmp_p
     single = json.loads(run(first, "--truth", lone, "--metrics", "psnr", "--json").stdout)
     assert any("filmed at other moments" in note for note in single["notes"])
     (tmp_path / "c.json").write_text(json.dumps(single))
-    shared = ["--truth", str(lone), "--metrics", "psnr", "--json"]
+    shared = ["--truth", lone, "--metrics", "psnr", "--json"]
 
-    def invoke(*words: str) -> dict:
-        return json.loads(CliRunner().invoke(evaluate.ROOM.application(), words).stdout)
+    def invoke(*words: object) -> dict:
+        return json.loads(evaluate(*words).stdout)
 
-    notes = invoke("compare", str(first), str(second), *shared)["notes"]
+    notes = invoke("compare", first, second, *shared)["notes"]
     assert [note for note in notes if note.startswith("A: ")] == [f"A: {note}" for note in single["notes"]]
     assert any(note.startswith("B: ") and "no alpha" in note for note in notes)
-    notes = invoke("runs", str(first), str(second), *shared)["notes"]
+    notes = invoke("runs", first, second, *shared)["notes"]
     assert [note for note in notes if note.startswith("a: ")] == [f"a: {note}" for note in single["notes"]]
-    notes = invoke("runs", str(tmp_path / "c.json"), "--json")["notes"]
+    notes = invoke("runs", tmp_path / "c.json", "--json")["notes"]
     assert notes == [f"a: {note}" for note in single["notes"]]
 
 
@@ -325,8 +322,7 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
 
 
 def test_a_pipe_is_read(said: Path, truth: Path) -> None:
-    words = ["video", "-", "--truth", str(truth), "--json"]
-    piped = CliRunner().invoke(evaluate.ROOM.application(), words, input=said.read_bytes())
+    piped = evaluate("video", "-", "--truth", truth, "--json", stdin=said.read_bytes())
     assert json.loads(piped.stdout)["metrics"] == json.loads(run(said, "--truth", truth, "--json").stdout)["metrics"]
     wrong = told("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
     assert (wrong.returncode, wrong.stdout) == (2, "") and "--protocol svd" in wrong.stderr

@@ -86,7 +86,7 @@ class Source(ABC):
     times: Sequence[float] | None = None
     numbers: Sequence[Sequence[int] | None] | None = None
     header: ViewsHeader | None = None
-    history: list[dict] = []
+    provenance: list[dict] = []
 
     @property
     def rate(self) -> float | None:

@@ -24,7 +24,7 @@ class ViewsSource(Source):
 
     def __init__(self, path: Path) -> None:
         self.path, self.reader = path, ViewsReader(path)
-        self.header, self.history = self.reader.header, self.reader.provenance
+        self.header, self.provenance = self.reader.header, self.reader.provenance
         roles, self.times = self.header.role, self.header.time
         self.views = [View(_view_names(i, role, roles[:i].count(role)), role) for i, role in enumerate(roles)]
         self.frames = [self.header.num_frames] * len(self.views)
@@ -50,7 +50,7 @@ class SceneSource(Source):
     def __init__(self, path: Path, header: ViewsHeader, truth: Path) -> None:
         from dpcli.store.gaussians import read_scene, scene_origin
 
-        self.path, self.header, self.scene, self.history = path, header, read_scene(path), scene_origin(path)[1]
+        self.path, self.header, self.scene, self.provenance = path, header, read_scene(path), scene_origin(path)[1]
         roles = header.role
         self.views = [View(_view_names(i, role, roles[:i].count(role)), role) for i, role in enumerate(roles)]
         self._check_times(truth)

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks.clip import Clip
 from dpcli.evaluate.networks.lpips import Lpips
@@ -26,6 +24,7 @@ from dpcli.evaluate.video.frechet.variants import feature_variant
 from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
 from tests.evaluate.video.test_comparison import FRAMES, clip, header, white, write
+from tests.support.evaluating import evaluate
 from tests.support.picture_metrics import ssim_reference
 
 ROLES = ("reference", "test", "test")
@@ -146,8 +145,8 @@ def test_warping_is_one_number_in_video_compare_and_runs(tmp_path: Path) -> None
     said, other = write(tmp_path / "said.h5", noisy, head), write(tmp_path / "other.h5", noisy[:, ::-1].copy(), head)
 
     def run(*arguments: object) -> dict:
-        given = [*map(str, arguments), "--truth", str(truth), "--metrics", "warping", "--json"]
-        return json.loads(CliRunner().invoke(evaluate.ROOM.application(), given, catch_exceptions=False).stdout)
+        given = [*arguments, "--truth", truth, "--metrics", "warping", "--json"]
+        return json.loads(evaluate(*given, raising=True).stdout)
 
     alone = [run("video", path)["metrics"]["warping"] for path in (said, other)]
     found = run("video", said)
@@ -159,9 +158,7 @@ def test_warping_is_one_number_in_video_compare_and_runs(tmp_path: Path) -> None
     assert [compared["a"], compared["b"]] == pytest.approx(alone)
     assert run("runs", said, other)["metrics"]["warping"]["mean"] == pytest.approx(np.mean(alone))
     (tmp_path / "video.json").write_text(json.dumps(found))
-    told = CliRunner().invoke(
-        evaluate.ROOM.application(), ["runs", str(tmp_path / "video.json"), "--json"], catch_exceptions=False
-    )
+    told = evaluate("runs", tmp_path / "video.json", "--json", raising=True)
     assert json.loads(told.stdout)["metrics"]["warping"]["mean"] == pytest.approx(alone[0])
 
 
@@ -249,7 +246,7 @@ def test_equal_videos_score_perfectly(files, fake_networks) -> None:
 def test_absent_weights_cost_only_their_own_metric(files, no_weights: Path) -> None:
     said, truth = map(str, files)
     command = ["video", said, "--truth", truth, "--metrics", "psnr,lpips,fvd,warping", "--protocol", "thesis", "--json"]
-    result = CliRunner().invoke(evaluate.ROOM.application(), command)
+    result = evaluate(*command)
     assert isinstance(result.exception, DataError)
     message = str(result.exception)
     assert message.startswith("lpips not computed (fvd neither): ") and "\n" not in message
