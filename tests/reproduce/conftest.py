@@ -9,7 +9,7 @@ import pytest
 from dpcli.runtime.run_folder import RunFolder
 
 
-@pytest.fixture(autouse=True, scope="package")
+@pytest.fixture(autouse=True, scope="module")
 def no_learning_curves():
     """No table shows them; a picture takes longer than these trainings."""
     with pytest.MonkeyPatch.context() as patch:
