@@ -48,7 +48,7 @@ def golden_file(shared_data: Path) -> Callable[[str], dict[str, np.ndarray]]:
     return load
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def one_thread():
     """Small tensors: on a busy machine torch's threads wait for each other a hundred times longer than they work."""
     import torch

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.choices import PARTS_PROTOCOLS
 from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
 from dpcli.runtime.machines.shards import describe_shard
@@ -94,6 +95,11 @@ def read_counted(
     if missing := _CHOICES - about.keys():
         raise DataError(
             f"{path}: its provenance lacks {', '.join(sorted(missing))}; name the parts file to count again"
+        )
+    if about["protocol"] not in PARTS_PROTOCOLS:
+        raise DataError(
+            f"{path}: was counted by protocol {about['protocol']!r}, expected {' or '.join(PARTS_PROTOCOLS)}; "
+            "name the parts file to count again"
         )
     kept = {**about, "truth": Path(about["truth"]).name}
     for key, value in {**asked, "truth": truth and Path(truth).name}.items():

@@ -43,16 +43,24 @@ def test_kept_counts_answer_only_what_they_were_counted_with(files, evaluate):
             evaluate(kept, None, ignore_below=20)
 
 
-def test_kept_counts_without_their_choices_are_refused(files):
-    folder, parts, truth = files
-    evaluate_segmentation(parts, truth, keeping=Keeping(folder / "edited.h5"))
-    with h5py.File(folder / "edited.h5", "r+") as file:
+@pytest.mark.parametrize("evaluate", [evaluate_segmentation, evaluate_motion])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda config: config.pop("truth"), "its provenance lacks truth"),
+        (lambda config: config.update(protocol="relaese"), "counted by protocol 'relaese', expected dpc or release"),
+    ],
+)
+def test_kept_counts_without_their_choices_are_refused(files, tmp_path, evaluate, change, words):
+    _, parts, truth = files
+    evaluate(parts, truth, keeping=Keeping(tmp_path / "edited.h5"))
+    with h5py.File(tmp_path / "edited.h5", "r+") as file:
         *_, last = file["provenance"][:]
         entry = json.loads(last)
-        del entry["config"]["truth"]
+        change(entry["config"])
         file["provenance"][-1] = json.dumps(entry)
-    with pytest.raises(DataError, match="its provenance lacks truth"):
-        evaluate_segmentation(folder / "edited.h5", None)
+    with pytest.raises(DataError, match=words):
+        evaluate(tmp_path / "edited.h5", None)
 
 
 @pytest.mark.parametrize("evaluate", [evaluate_segmentation, evaluate_motion])

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from safetensors.torch import load_file
 
 from dpcli.generate4d.commands.train_prior import train_shape_prior
@@ -33,17 +32,12 @@ from tests.support.pretend_card import pretend_card
 WORDS = ("--preset", "tiny", "--jobs", 1, "--steps", 8, "--set", "reuse=1", "--set", "validation=6")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    """As the fixture `one_thread`: all trainings here, also that of a process of its own, add in one order."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+# all trainings here, also that of a process of its own, add in one order
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(one_thread, tmp_path_factory):
     """A training that nobody stopped."""
     folder = tmp_path_factory.mktemp("prior") / "run"
     assert exit_code("generate4d", "train-prior", "-o", folder, *WORDS) == 0

@@ -37,7 +37,7 @@ _MEMORY = 0.999  # of the running mean of the weights
 class ShapeTrainer:
     """Trains a network on rounds of pictures; `best.safetensors` has the running mean of least error on held-out models.
 
-    Adam, cosine learning rate. The log gets a row and the state is saved 60 times in all.
+    Adam, cosine learning rate. The log gets a row and the state is saved about 60 times in all.
     """
 
     def __init__(
