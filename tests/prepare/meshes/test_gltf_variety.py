@@ -90,6 +90,25 @@ def test_emission_has_its_own_texture_coordinates_and_adds_to_the_base_color(tmp
     assert image[32, 5, :3].tolist() == [255, 0, 255] and image[32, 58, :3].tolist() == [255, 255, 0]
 
 
+@pytest.mark.parametrize(
+    "diffuse, red",
+    [
+        ({"diffuseFactor": [0.5, 0, 0, 1]}, 188),
+        ({"diffuseTexture": {"index": 0}}, 188),
+        ({"diffuseFactor": [0.5, 1, 1, 1], "diffuseTexture": {"index": 0}}, 137),
+        ({"glossinessFactor": 0.3}, 137),
+    ],
+)
+def test_the_older_color_of_a_material_is_not_multiplied_by_the_newer_one(tmp_path, diffuse, red):
+    """As glTF-Transform's palette() leaves it: the newer color in a texture, the older one in a factor."""
+    file = quad()
+    file.picture(np.array([[[188, 0, 0, 255]]], np.uint8))
+    material = file.tree["materials"][0]
+    material["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0, 0, 1]
+    material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": diffuse}
+    np.testing.assert_allclose(look(load(file, tmp_path))[32, 32, :3].astype(int), [red, 0, 0], atol=1)
+
+
 # light
 
 
