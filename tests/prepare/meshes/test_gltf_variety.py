@@ -265,6 +265,12 @@ def test_instances_are_drawn_where_they_stand(tmp_path, capsys):
     expected = [rest - [3, 0, 0], rest[:, [1, 0, 2]] * [-0.5, 1, 1], rest * [-1, 1, 1] + [3, 0, 0]]
     np.testing.assert_allclose(found, np.array(expected) + [0, 7, 0], atol=1e-6)
     assert "not read" not in capsys.readouterr().err
+    vertex = file.add(np.tile([1.0, 0.5, 1], (4, 1)))
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = vertex
+    colors = [[255, 0, 0], [0, 255, 0], [51, 51, 51]]  # as three.js writes those of its InstancedMesh
+    attributes["_COLOR_0"] = file.add(colors, "u1", normalized=True)
+    shown = [[1, 0, 0, 1], [0, 0.5, 0, 1], [0.2, 0.1, 0.2, 1]]
+    np.testing.assert_allclose(load(file, tmp_path).color, np.repeat(shown, 4, axis=0), atol=1e-6)
     file.tree["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"]["SCALE"] = file.add([[1.0, 1, 1]])
     with pytest.raises(DataError, match=r"instances of node 0: their attributes have \[1, 3\] entries"):
         load(file, tmp_path)
