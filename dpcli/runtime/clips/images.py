@@ -23,6 +23,7 @@ IMAGE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif"),
     *(".jfif", ".tga", ".jp2", ".ppm"),
 )
+ORIENTATION = 0x0112  # of EXIF
 _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds

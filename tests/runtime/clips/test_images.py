@@ -37,7 +37,7 @@ def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
     exif[0x0112] = orientation
     turned.save(tmp_path / "0.png", exif=exif)
     np.testing.assert_array_equal(read_rgba(tmp_path / "0.png")[..., :3], rgb)
-    for kind in ("png", "webp"):  # FFmpeg decodes the one, and turns it, Pillow the other
+    for kind in ("png", "webp"):  # the one is laid here, the other by Pillow
         other = Image.new("RGB", turned.size)
         turned.save(tmp_path / f"moving.{kind}", exif=exif, save_all=True, append_images=[other], lossless=True)
         np.testing.assert_array_equal(next(open_frames(tmp_path / f"moving.{kind}").read([0]))[..., :3], rgb)
