@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.runtime.clips.images import as_rgba
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CONTROL = struct.Struct(
@@ -61,7 +62,7 @@ def apng_canvases(path: Path, width: int, height: int) -> Iterator[np.ndarray]:
         if box[2] > width or box[3] > height:
             raise DataError(f"{path}: a picture reaches beyond its canvas of {width} x {height}; export it again")
         with Image.open(io.BytesIO(_alone(before, picture))) as image:
-            own = _rgba(image)
+            own = as_rgba(image)
         shown = canvas.copy()
         shown.paste(Image.alpha_composite(canvas.crop(box), own) if picture.over else own, box)
         yield np.asarray(shown)
@@ -69,17 +70,6 @@ def apng_canvases(path: Path, width: int, height: int) -> Iterator[np.ndarray]:
             canvas = shown
         if picture.after == _CLEARED:
             canvas.paste((0, 0, 0, 0), box)
-
-
-def _rgba(image):  # image: PIL.Image.Image -> PIL.Image.Image
-    """Returns the picture with alpha; gray of 16 bits, which Pillow would cut off at 255, is scaled."""
-    from PIL import Image
-
-    if not image.mode.startswith("I"):
-        return image.convert("RGBA")
-    gray, clear = np.asarray(image).astype(np.int64), image.info.get("transparency")
-    level = np.rint(gray / 257).astype(np.uint8)
-    return Image.fromarray(np.dstack([level, level, level, np.where(gray == clear, 0, 255).astype(np.uint8)]))
 
 
 def _pictures(path: Path, data: bytes) -> Iterator[_Picture]:

@@ -17,6 +17,7 @@ _BY_KIND = {  # color type, bits, chunks before the pictures, and how red and cl
     "gray of 16 bits": (0, 16, {b"tRNS": b"\x09\0"}, [204 * 257], [0x900]),
     "colors": (2, 8, {}, [204, 0, 0], None),
     "colors of 16 bits": (2, 16, {}, [204 * 257, 0, 0], None),
+    "colors of 16 bits, one of them clear": (2, 16, {b"tRNS": b"\x09" + bytes(5)}, [204 * 257, 0, 0], [0x900, 0, 0]),
     "palette": (3, 8, {b"PLTE": bytes([1, 2, 3, 204, 0, 0]), b"tRNS": b"\0"}, [1], [0]),
     "gray and alpha": (4, 8, {}, [204, 255], [7, 0]),
     "gray and alpha of 16 bits": (4, 16, {}, [204 * 257, 65535], [7, 0]),
