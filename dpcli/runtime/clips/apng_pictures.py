@@ -19,9 +19,8 @@ from dpcli.errors import DataError
 from dpcli.runtime.clips.images import as_rgba
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_CONTROL = struct.Struct(
-    ">5I2H2B"
-)  # number, width, height, left, top, delay as a fraction of seconds, afterwards, over
+# number, width, height, left, top, delay as a fraction of seconds, afterwards, over
+_CONTROL = struct.Struct(">5I2H2B")
 _CLEARED, _AS_BEFORE = 1, 2  # what becomes of a picture once its time is over
 _TENTHS = 100  # of a second, in a delay without a denominator
 
