@@ -20,6 +20,7 @@ from dpcli.runtime.clips.animations import animation_frames, animation_times, is
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import (
     IMAGE_SUFFIXES,
+    ORIENTATION,
     as_shown,
     one_series,
     open_image,
@@ -43,7 +44,6 @@ PICTURE_FOLDERS = {
     "frames",
     "color",
 }  # names that say nothing else
-_ORIENTATION = 0x0112  # of EXIF
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -195,7 +195,7 @@ def read_rgba(path: Path) -> np.ndarray:
 def image_size(path: Path) -> tuple[int, int]:
     """Returns the width and height of one image as it is shown, by its header. Raises DataError when unreadable."""
     with _readable(path) as image:
-        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+        turned = image.getexif().get(ORIENTATION, 1) in (5, 6, 7, 8)
         return image.size[::-1] if turned else image.size
 
 

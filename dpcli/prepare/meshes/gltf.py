@@ -25,7 +25,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.meshes.other_formats import is_folder, not_gltf, refuse_other_formats
-from dpcli.runtime.clips.images import require_plausible
+from dpcli.runtime.clips.images import as_rgba, require_plausible
 from dpcli.text_files import parse_json
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -266,20 +266,12 @@ class Gltf:
         try:
             with Image.open(io.BytesIO(data)) as picture:
                 require_plausible(self.path, *picture.size, len(data))
-                return _rgba(picture)
+                return np.array(as_rgba(picture))
         except UnidentifiedImageError:
             kind = "KTX2" if data.startswith(b"\xabKTX 20\xbb") else entry.get("mimeType", "of an unknown kind")
             raise self.fail(f"texture {index} is {kind}, which is not read; export it as PNG or JPEG") from None
         except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise self.fail(f"texture {index} ({entry.get('mimeType', 'image')}) cannot be read: {error}") from None
-
-
-def _rgba(picture: Any) -> np.ndarray:
-    """Returns pixels u8 (H,W,4) of an opened picture; gray of 16 bits, which Pillow would cut off at 255, is scaled."""
-    if picture.mode.startswith("I"):
-        gray = (np.asarray(picture).astype(np.int64) // 257).astype(np.uint8)
-        return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
-    return np.array(picture.convert("RGBA"))
 
 
 @contextmanager

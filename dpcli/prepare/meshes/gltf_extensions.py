@@ -43,6 +43,7 @@ _UNSEEN = {  # what they say does not change a picture
 _ADVICE = {"KHR_texture_basisu": "export its textures as PNG or JPEG"}
 _METHOD, _EDGEBREAKER = 8, 1  # the byte of a Draco block that names its encoding, and the one that keeps no order
 _IDENTITY = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
+_COLOR = "_COLOR_0"  # of instances
 
 
 def refuse_required(file: Gltf) -> None:
@@ -69,8 +70,10 @@ def _names_of(entry: dict[str, Any]) -> list[str]:
     return list(found) if isinstance(found, dict) else []
 
 
-def instances(file: Gltf, node: int) -> np.ndarray | None:
-    """Returns the transforms f64 (N,4,4) of a node's instances (EXT_mesh_gpu_instancing), or None without them."""
+def instances(file: Gltf, node: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns the transforms f64 (N,4,4) of a node's instances (EXT_mesh_gpu_instancing), and their colors f32 (N,3 or 4), white
+    where the file has none; or None without instances. Colors are three.js's: the extension leaves further attributes free.
+    """
     entry: dict[str, Any] = file.item("nodes", node).get("extensions", {}).get("EXT_mesh_gpu_instancing")
     if entry is None:
         return None
@@ -80,12 +83,15 @@ def instances(file: Gltf, node: int) -> np.ndarray | None:
         for key, index in entry.get("attributes", {}).items()
         if key in _IDENTITY
     }
-    counts = {len(values) for values in given.values()}
+    colors = None
+    if _COLOR in entry.get("attributes", {}):
+        colors = file.accessor(entry["attributes"][_COLOR], what).astype(np.float32)
+    counts = {len(values) for values in (*given.values(), *([] if colors is None else [colors]))}
     if len(counts) != 1:
         raise file.fail(f"{what}: their attributes have {sorted(counts)} entries; expected one number for all")
     count = counts.pop()
     values = [given.get(key, np.tile(rest, (count, 1))) for key, rest in _IDENTITY.items()]
-    return matrices(*values)
+    return matrices(*values), np.ones((count, 3), np.float32) if colors is None else colors
 
 
 def decompress(file: Gltf, primitive: dict[str, Any], where: str) -> None:

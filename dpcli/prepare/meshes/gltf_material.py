@@ -10,6 +10,7 @@ from dpcli.prepare.meshes.animated_mesh import Material, Texture
 from dpcli.prepare.meshes.gltf import Gltf
 
 _NEAREST = 9728
+_DIFFUSE = ("diffuseFactor", "diffuseTexture")
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
@@ -70,8 +71,8 @@ def _references(file: Gltf, index: int) -> tuple[dict[str, Any] | None, Any, dic
     metal = entry.get("pbrMetallicRoughness", {})
     color, texture = metal.get("baseColorFactor"), metal.get("baseColorTexture")
     old = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-    if old is not None:  # older exports keep their colors there
-        color, texture = old.get("diffuseFactor", color), old.get("diffuseTexture", texture)
+    if old and not old.keys().isdisjoint(_DIFFUSE):  # older exports keep their colors there, both or neither
+        color, texture = (old.get(key) for key in _DIFFUSE)
     return texture, color, entry.get("emissiveTexture")
 
 

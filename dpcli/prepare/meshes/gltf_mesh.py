@@ -223,23 +223,24 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
         log.warn(f"{file.path}: points and lines of {node_name(file, index)!r} are left out, {left}")
     skins = _read_skin(file, node["skin"]) if "skin" in node else None
     pieces = [_read_primitive(file, index, primitive, skins) for primitive in kept]
-    transforms = instances(file, index)
-    if transforms is None:
+    found = instances(file, index)
+    if found is None:
         return pieces
+    transforms, colors = found[0], _colors(file, found[1], f"instances of {node_name(file, index)!r}")
     if len(transforms) * sum(len(piece.positions) for piece in pieces) > _MOST_VERTICES:
         raise file.fail(f"{len(transforms)} instances of {node_name(file, index)!r} are too many to draw")
-    return [copy for piece in pieces for copy in _copies(piece, transforms)]
+    return [copy for piece in pieces for copy in _copies(piece, transforms, colors)]
 
 
-def _copies(piece: _Piece, transforms: np.ndarray) -> list[_Piece]:
-    """Returns one piece for each instance, placed by its transform (N,4,4) below the node."""
+def _copies(piece: _Piece, transforms: np.ndarray, colors: np.ndarray) -> list[_Piece]:
+    """Returns one piece for each instance, placed by its transform (N,4,4) below the node, times its color f32 (N,4)."""
     bones, weights = np.zeros((len(piece.positions), 1), int), np.ones((len(piece.positions), 1))
     placed, turned = skin(piece.positions, piece.normals, bones, weights, transforms[:, None])
     made = []
-    for transform, positions, normals in zip(transforms, placed, turned):
+    for transform, color, positions, normals in zip(transforms, colors, placed, turned):
         mirrored = np.linalg.det(transform[:3, :3]) < 0
         triangles = piece.triangles[:, ::-1] if mirrored else piece.triangles
-        copy = replace(piece, positions=positions, normals=normals, triangles=triangles)
+        copy = replace(piece, positions=positions, normals=normals, triangles=triangles, color=piece.color * color)
         if piece.targets is not None:
             copy.targets = piece.targets @ transform[:3, :3].T
             copy.normal_targets = piece.normal_targets @ transform[:3, :3].T

@@ -9,10 +9,10 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.apng_pictures import apng_canvases, apng_seconds, is_animated_png
 from dpcli.runtime.clips.container_ends import pictures_in
 from dpcli.runtime.clips.gif_pictures import check_canvas, gif_canvases
-from dpcli.runtime.clips.images import as_shown, open_image
-from dpcli.runtime.clips.video_frames import video_frames
+from dpcli.runtime.clips.images import ORIENTATION, as_shown, open_image
 from dpcli.runtime.progress import log
 
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
@@ -39,12 +39,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
         with open_image(path) as image:
             if image.format == "GIF":
                 check_canvas(path, image.width * image.height, path.stat().st_size)
-            first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
-            for index in range(first, getattr(image, "n_frames", 1)):
-                image.seek(index)
-                image.load()
+            for duration in _durations(path, image):
                 times.append(now)
-                duration = float(image.info.get("duration", 0) or 0)
                 now += (duration if duration > _SHORTEST else _INSTEAD) / 1000
             moves, form = image.format in ("GIF", "PNG", "WEBP", "AVIF"), image.format
     except DataError:
@@ -60,25 +56,37 @@ def animation_times(path: Path) -> tuple[float, ...]:
     return tuple(times)
 
 
+def _durations(path: Path, image) -> Iterator[float]:  # image: PIL.Image.Image
+    """Yields the milliseconds that each frame lasts. Raises nearly anything at one that is damaged."""
+    if image.format == "PNG" and is_animated_png(path.read_bytes()):
+        seconds = apng_seconds(path)
+        yield from (1000 * one for one, _ in zip(seconds, apng_canvases(path, *image.size), strict=True))
+        return
+    for index in range(getattr(image, "n_frames", 1)):
+        image.seek(index)
+        image.load()
+        yield float(image.info.get("duration", 0) or 0)
+
+
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """Yields frames by rising index, each u8 (H,W,4) with straight alpha.
 
-    FFmpeg decodes APNG: Pillow lays one frame over another as if what is below were opaque. Nor does it lay a GIF's as
-    browsers do.
+    Pillow lays the pictures of neither a PNG nor a GIF over one another as browsers do.
     """
     from PIL import Image
 
     with reading(path), open_image(path) as image:
-        info = dict(image.info)
-        if image.format == "PNG":
-            for frame in video_frames(path, wanted, as_stored=True):
-                yield np.array(as_shown(Image.fromarray(frame), info))
-            return
-        if image.format == "GIF":
-            canvases = enumerate(gif_canvases(path, *image.size))
+        info, orientation = dict(image.info), 1
+        laid = gif_canvases if image.format == "GIF" else None
+        if image.format == "PNG" and is_animated_png(path.read_bytes()):
+            laid, orientation = apng_canvases, image.getexif().get(ORIENTATION, 1)
+        if laid:
+            canvases = enumerate(laid(path, *image.size))
             for index in wanted:
                 shown = next(canvas for at, canvas in canvases if at == index)
-                yield np.array(as_shown(Image.fromarray(shown), info))
+                picture = Image.fromarray(shown)
+                picture.getexif()[ORIENTATION] = orientation
+                yield np.array(as_shown(picture, info))
             return
         for index in wanted:
             image.seek(index)

@@ -23,6 +23,7 @@ IMAGE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif"),
     *(".jfif", ".tga", ".jp2", ".ppm"),
 )
+ORIENTATION = 0x0112  # of EXIF
 _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds
@@ -34,6 +35,7 @@ _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
 _PLANES, _APART = 284, 2  # the same: whether the channels lie one after the other
 _OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
+_GRAY_SCALES = {"L;2": 85, "L;4": 17}  # of fewer bits than 8, by Pillow's names for them
 
 
 def is_plausible(width: int, height: int, held: int) -> bool:
@@ -69,6 +71,7 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
         _tell_unread_channel(path, image)
+        _scale_clear_level(image)
         yield image
 
 
@@ -93,6 +96,30 @@ def _with_alpha_of_webp(path: Path) -> BytesIO | None:
         if start[:4] != b"RIFF" or start[8:16] != b"WEBPVP8X" or start[-1] & (_MOVES | _ALPHA) != _MOVES:
             return None
         return BytesIO(start[:-1] + bytes([start[-1] | _ALPHA]) + file.read())
+
+
+def _scale_clear_level(image) -> None:  # image: PIL.Image.Image
+    """Brings the level or color that an opened PNG names as see-through to the scale of its pixels: Pillow scales gray of 2 and 4
+    bits and colors of 16 bits to 8, but not that, so that all would be opaque.
+    """
+    stored = str(image.tile[0][3]) if image.format == "PNG" and image.tile else ""
+    clear = image.info.get("transparency")
+    if stored in _GRAY_SCALES and isinstance(clear, int):
+        image.info["transparency"] = clear * _GRAY_SCALES[stored]
+    elif stored == "RGB;16B" and isinstance(clear, tuple):
+        image.info["transparency"] = tuple(level >> 8 for level in clear)
+
+
+def as_rgba(image):  # image: PIL.Image.Image -> PIL.Image.Image
+    """Returns a picture that Pillow has just opened with alpha; gray of 16 bits, which Pillow would cut off at 255, is scaled."""
+    from PIL import Image
+
+    _scale_clear_level(image)
+    if not image.mode.startswith("I"):
+        return image.convert("RGBA")
+    gray, clear = np.asarray(image).astype(np.int64), image.info.get("transparency")
+    level = np.rint(gray / 257).astype(np.uint8)
+    return Image.fromarray(np.dstack([level, level, level, np.where(gray == clear, 0, 255).astype(np.uint8)]))
 
 
 def _tell_unread_channel(path: Path, image) -> None:  # image: PIL.Image.Image

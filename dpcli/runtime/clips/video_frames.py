@@ -67,9 +67,8 @@ def look_at_video(path: Path) -> VideoLook:
     return _look(path, state.st_mtime_ns, state.st_size)
 
 
-def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) -> Iterator[np.ndarray]:
-    """Yields frames by rising index, each u8 (H,W,4), straight alpha, opaque where the video has none; as_stored: in the
-    colors of the file, not in sRGB.
+def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
+    """Yields frames by rising index, each u8 (H,W,4), straight alpha, opaque where the video has none.
 
     Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
     """
@@ -83,8 +82,8 @@ def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) 
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
             if matrix is None:  # one for all of them
                 matrix = display_matrix(frame)
-                empty = _has_alpha(frame) and not as_stored and look_at_video(path).is_empty
-            picture = _rgba(frame, stream.sample_aspect_ratio, hidden, as_stored)
+                empty = _has_alpha(frame) and look_at_video(path).is_empty
+            picture = _rgba(frame, stream.sample_aspect_ratio, hidden)
             if empty:
                 picture[..., 3] = 255
             yield as_it_plays(picture, matrix)
@@ -398,7 +397,7 @@ def _margins(path: Path, container, stream) -> Margins:
 
 
 # frame: av.VideoFrame, aspect: Fraction | None
-def _rgba(frame, aspect, hidden: Margins, as_stored: bool) -> np.ndarray:
+def _rgba(frame, aspect, hidden: Margins) -> np.ndarray:
     """Returns u8 (H,W,4) of a decoded frame as it is shown but for turns: full range, square pixels, without margins."""
     width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
     options = {"threads": 1}  # more convert strips of their own: other rounding at other numbers of cores
@@ -407,7 +406,7 @@ def _rgba(frame, aspect, hidden: Margins, as_stored: bool) -> np.ndarray:
     if not frame.format.is_rgb and not frame.format.name.startswith("gray"):
         options["src_color_range"] = int(frame.color_range) or (_FULL_RANGE if "yuvj" in frame.format.name else 1)
     transfer, primaries = int(frame.color_trc), int(frame.color_primaries)
-    if wide_color.is_wide(transfer, primaries) and not as_stored:
+    if wide_color.is_wide(transfer, primaries):
         deep = frame.reformat(width, frame.height, "rgba64le", **options).to_ndarray()
         rgb, alpha = wide_color.to_srgb(deep[..., :3], transfer, primaries), deep[..., 3:] >> 8
         picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)

@@ -90,6 +90,25 @@ def test_emission_has_its_own_texture_coordinates_and_adds_to_the_base_color(tmp
     assert image[32, 5, :3].tolist() == [255, 0, 255] and image[32, 58, :3].tolist() == [255, 255, 0]
 
 
+@pytest.mark.parametrize(
+    "diffuse, red",
+    [
+        ({"diffuseFactor": [0.5, 0, 0, 1]}, 188),
+        ({"diffuseTexture": {"index": 0}}, 188),
+        ({"diffuseFactor": [0.5, 1, 1, 1], "diffuseTexture": {"index": 0}}, 137),
+        ({"glossinessFactor": 0.3}, 137),
+    ],
+)
+def test_the_older_color_of_a_material_is_not_multiplied_by_the_newer_one(tmp_path, diffuse, red):
+    """As glTF-Transform's palette() leaves it: the newer color in a texture, the older one in a factor."""
+    file = quad()
+    file.picture(np.array([[[188, 0, 0, 255]]], np.uint8))
+    material = file.tree["materials"][0]
+    material["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0, 0, 1]
+    material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": diffuse}
+    np.testing.assert_allclose(look(load(file, tmp_path))[32, 32, :3].astype(int), [red, 0, 0], atol=1)
+
+
 # light
 
 
@@ -246,6 +265,12 @@ def test_instances_are_drawn_where_they_stand(tmp_path, capsys):
     expected = [rest - [3, 0, 0], rest[:, [1, 0, 2]] * [-0.5, 1, 1], rest * [-1, 1, 1] + [3, 0, 0]]
     np.testing.assert_allclose(found, np.array(expected) + [0, 7, 0], atol=1e-6)
     assert "not read" not in capsys.readouterr().err
+    vertex = file.add(np.tile([1.0, 0.5, 1], (4, 1)))
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = vertex
+    colors = [[255, 0, 0], [0, 255, 0], [51, 51, 51]]  # as three.js writes those of its InstancedMesh
+    attributes["_COLOR_0"] = file.add(colors, "u1", normalized=True)
+    shown = [[1, 0, 0, 1], [0, 0.5, 0, 1], [0.2, 0.1, 0.2, 1]]
+    np.testing.assert_allclose(load(file, tmp_path).color, np.repeat(shown, 4, axis=0), atol=1e-6)
     file.tree["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"]["SCALE"] = file.add([[1.0, 1, 1]])
     with pytest.raises(DataError, match=r"instances of node 0: their attributes have \[1, 3\] entries"):
         load(file, tmp_path)

@@ -37,10 +37,34 @@ def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
     exif[0x0112] = orientation
     turned.save(tmp_path / "0.png", exif=exif)
     np.testing.assert_array_equal(read_rgba(tmp_path / "0.png")[..., :3], rgb)
-    for kind in ("png", "webp"):  # FFmpeg decodes the one, and turns it, Pillow the other
+    for kind in ("png", "webp"):  # the one is laid here, the other by Pillow
         other = Image.new("RGB", turned.size)
         turned.save(tmp_path / f"moving.{kind}", exif=exif, save_all=True, append_images=[other], lossless=True)
         np.testing.assert_array_equal(next(open_frames(tmp_path / f"moving.{kind}").read([0]))[..., :3], rgb)
+
+
+@pytest.mark.parametrize("color_type, bits", [(0, 1), (0, 2), (0, 4), (0, 8), (0, 16), (2, 8), (2, 16)])
+def test_the_level_that_a_png_names_is_see_through_at_any_depth(tmp_path, color_type, bits):
+    """As programs that make PNGs smaller write sprites of few grays: clear, dark and bright, by 8 pixels each."""
+    top, wide = 2**bits - 1, 3 if color_type == 2 else 1
+    levels = np.repeat([1, 0, top], 8) if bits > 1 else np.repeat([1, 0, 0], 8)
+    samples = np.repeat(levels, wide)
+    if bits < 8:
+        row = np.packbits((samples[:, None] >> np.arange(bits)[::-1]) & 1).tobytes()
+    else:
+        row = samples.astype(">u2" if bits == 16 else "u1").tobytes()
+    if bits == 16:  # more than the low byte tells it apart
+        row = row.replace(b"\0\1", b"\x40\0")
+    clear = struct.pack(">H", 0x4000 if bits == 16 else 1) * wide
+    chunks = [(b"IHDR", struct.pack(">2I5B", 24, 1, bits, color_type, 0, 0, 0)), (b"tRNS", clear)]
+    chunks += [(b"IDAT", zlib.compress(b"\0" + row)), (b"IEND", b"")]
+    data = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks)
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(data))
+    rgba = read_rgba(tmp_path / "a.png")
+    np.testing.assert_array_equal(rgba[0, :, 3], np.repeat([0, 255, 255], 8))
+    np.testing.assert_array_equal(rgba[0, 8:, 0], np.repeat([0, 255 if bits > 1 else 0], 8))
+    if (color_type, bits) != (0, 16):  # there labels are what counts
+        np.testing.assert_array_equal(read_mask(tmp_path / "a.png")[0], rgba[0, :, 3])
 
 
 def shown(rgb: np.ndarray, primaries, gamma: float) -> np.ndarray:
