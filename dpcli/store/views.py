@@ -155,7 +155,7 @@ class ViewsWriter:
         try:
             self._create(seed, source, track, part)
         except BaseException as error:
-            self._atomic.failed(type(error), error, None)
+            self._atomic.failed(error)
             raise
 
     def _create(self, seed: int, source: str, track: np.ndarray | None, part: np.ndarray | None) -> None:
@@ -205,8 +205,8 @@ class ViewsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._atomic.failed(kind, error, trace)
+        if error is not None:
+            self._atomic.failed(error)
             return
         if not self._written.all():
             view, frame = np.argwhere(~self._written)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from dpcli.runtime.whole_file import (
     whole_file,
     write_whole,
 )
-from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store import CloudSequence
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
 POINT_OPACITY = 0.3  # least opacity of a Gaussian that is a point of the object
@@ -140,21 +139,3 @@ def as_sequence(
     return CloudSequence.from_frames(
         name, list(frames), time=scene.time, pose=pose, **{key: [value] * count for key, value in per_point.items()}
     )
-
-
-def write_clouds(
-    path: Path,
-    sequence: CloudSequence,
-    *,
-    provenance: Sequence[dict],
-    source: str,
-    seed: int,
-    length_unit: str = "",
-    force: bool = False,
-) -> None:
-    """Writes a `clouds` file of one sequence."""
-    fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
-    with CloudsWriter(
-        path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force
-    ) as writer:
-        writer.write(sequence)
