@@ -12,6 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
+from dpcli.path_names import frame_names
 from dpcli.runtime.whole_file import (
     check_replaced,
     not_writable,
@@ -72,8 +73,7 @@ def export_sequence(
         refuse_replacing(path, force)
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
-    width = max(4, len(str(scene.num_frames)))
-    names = [f"frame{number:0{width}d}.{form}" for number in range(1, scene.num_frames + 1)]
+    names = frame_names(range(1, scene.num_frames + 1), f".{form}", "frame")
     try:
         with whole_file(folder) as part:
             _make_folder(part, folder)
