@@ -16,6 +16,7 @@ from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
     PACKED,
+    absent,
     history_of,
     open_store,
     read_provenance,
@@ -236,14 +237,14 @@ class ViewsReader:
 
     def _load_header(self, file: h5py.File) -> ViewsHeader:
         for key in ("rgba", "intrinsics", "world_to_camera", "time"):
-            if key not in file or file[key].dtype.kind not in "fu":
-                raise DataError(f"{self.path}: data set {key!r} is missing or not numeric; make the file again")
+            if key not in file:
+                raise absent(self.path, key)
         for key in ("name", "reference"):
             if key not in file.attrs:
                 raise DataError(f"{self.path}: attribute {key!r} is missing; the file is incomplete, make it again")
         role, rgba = read_strings(file, "role"), file["rgba"]
         found = (len(role), len(file["time"]))
-        if rgba.dtype != np.uint8 or rgba.ndim != 5 or rgba.shape[:2] != found or rgba.shape[4] != 4:
+        if rgba.shape[:2] != found:
             raise DataError(
                 f"{self.path}: rgba is {rgba.dtype} {rgba.shape}, expected uint8 "
                 f"(views = {found[0]}, frames = {found[1]}, height, width, 4)"
