@@ -47,6 +47,16 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
     return [folder or stem if counts[stem] > 1 else stem for stem, folder in zip(stems, folders)]
 
 
+def frame_names(numbers: range, suffix: str, before: str = "") -> list[str]:
+    """Returns a file name for each number of a frame, with so many digits that their order as text is that of the frames.
+
+    >>> frame_names(range(2), ".png"), frame_names(range(1, 10_001), ".ply", "frame")[::9999]
+    (['0000.png', '0001.png'], ['frame00001.ply', 'frame10000.ply'])
+    """
+    digits = max(4, len(str(numbers.stop - 1)))
+    return [f"{before}{number:0{digits}d}{suffix}" for number in numbers]
+
+
 def file_names(names: Sequence[str], otherwise: str = "object") -> list[str]:
     """Returns a different name of a file or folder, without its suffix, for each of some names that stand in a file.
 

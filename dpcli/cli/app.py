@@ -184,22 +184,25 @@ def _check_value(value: Any, option: Any) -> None:
         raise DataError(f"{value}: permission denied")
 
 
-def _checking_values(command: Any) -> Any:
-    """Makes the command, or all below it, refuse options that are NaN or too large for float32, and unreadable paths.
+def _checking(command: Any) -> Any:
+    """Makes the command, or all below it, refuse outputs that must not be written and values that no command can take.
 
     A value that is so by default passes. Where memory ends, options far above their defaults are named.
     """
     for below in getattr(command, "commands", {}).values():
-        _checking_values(below)
+        _checking(below)
     run = command.callback
     if run is None:
         return command
     options = {one.name: one for one in command.params}
+    written = {name: one.opts[0] for name, one in options.items() if name in _WRITTEN}
     for one in command.params:
         one.type_descriptor.parameter_info.readable = False  # typer would call it wrong use
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:
+        if written:
+            _check_outputs(written, values)
         for name, value in values.items():
             for one in value if isinstance(value, (list, tuple)) else [value]:
                 _check_value(one, options[name])
@@ -211,6 +214,24 @@ def _checking_values(command: Any) -> Any:
     return command
 
 
+def _check_outputs(written: dict[str, str], values: dict[str, Any]) -> None:
+    """Raises UsageError where an output would replace an input or what is no regular file, DataError without permission.
+
+    written: parameter -> option of what the command writes. values: by parameter.
+    """
+    from dpcli.runtime.whole_file import check_regular, check_writable
+    from dpcli.store.pipes import check_output
+
+    inputs = [path for name, value in values.items() if name not in written for path in _paths_in(value)]
+    for name, option in written.items():
+        if name != "output" and str(values.get(name)) == "-":
+            check_regular(Path("-"), option)
+        if values.get(name) and str(values[name]) != "-":
+            check_output(Path(values[name]), option, inputs)
+            if name != "output" or values.get("force"):  # else it may be complete, and nothing is written
+                check_writable(Path(values[name]), option)
+
+
 def _paths_in(value: Any) -> list[str]:
     """Returns what may name files in an argument: of a text with commas its pieces, too."""
     if isinstance(value, (list, tuple)):
@@ -220,38 +241,10 @@ def _paths_in(value: Any) -> list[str]:
     return [str(value)] if isinstance(value, Path) else []
 
 
-def _keeping_inputs(command: Any) -> Any:
-    """Makes the command, or all below it, refuse to write over its inputs, over what is no regular file, or without permission."""
-    for below in getattr(command, "commands", {}).values():
-        _keeping_inputs(below)
-    run = command.callback
-    written = {one.name: one.opts[0] for one in command.params if one.name in _WRITTEN}
-    if run is None or not written:
-        return command
-
-    @functools.wraps(run)
-    def checked(*args: Any, **values: Any) -> Any:
-        from dpcli.runtime.whole_file import check_regular, check_writable
-        from dpcli.store.pipes import check_output
-
-        inputs = [path for name, value in values.items() if name not in written for path in _paths_in(value)]
-        for name, option in written.items():
-            if name != "output" and str(values.get(name)) == "-":
-                check_regular(Path("-"), option)
-            if values.get(name) and str(values[name]) != "-":
-                check_output(Path(values[name]), option, inputs)
-                if name != "output" or values.get("force"):  # else it may be complete, and nothing is written
-                    check_writable(Path(values[name]), option)
-        return run(*args, **values)
-
-    command.callback = checked
-    return command
-
-
 def main(argv: list[str] | None = None) -> None:
     """Runs `dpc` and exits with one of the codes in docs/architecture.md."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_checking_values(typer.main.get_command(application(_words_to_complete() or arguments))))
+    command = _checking(typer.main.get_command(application(_words_to_complete() or arguments)))
     code = _run(command, arguments)
     let_end()
     ended = signal_outcome() or (INTERRUPTED, "interrupted")

@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.standard_streams import printable, rich_console
 
 _SAMPLES, _FRAMES = 8, 8
-_CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
+_CLASSES_SHOWN, _COMMAND_SHOWN, _SAMPLES_SHOWN = 100, 300, 20
 
 
 def info(
@@ -144,16 +144,19 @@ def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str
 
 def _show(found: dict[str, Any]) -> None:
     console = rich_console(sys.stdout)
-    for name, value in _lines(found):
-        console.print(printable(f"{name:<20} {value}"), soft_wrap=True)
+    _print_lines(console, _lines(found), 20)
     if found.get("classes"):
         console.print()
         console.print(_class_table(found), soft_wrap=True)
     for number, entry in enumerate(found["provenance"], 1):
         short = _shortened(str(entry.get("command", "")))
         console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", soft_wrap=True)
-    for name, value in _settings_lines(found):
-        console.print(printable(f"{name:<20} {value}"), soft_wrap=True)
+    _print_lines(console, _settings_lines(found), 20)
+
+
+def _print_lines(console: Any, lines: list[tuple[str, str]], width: int) -> None:
+    for name, value in lines:
+        console.print(printable(f"{name:<{width}} {value}"), soft_wrap=True)
 
 
 def _settings_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
@@ -180,8 +183,7 @@ def _show_model(told: dict[str, Any]) -> None:
     for key, value in (told["header"] | told.get("settings", {})).items():
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
-    for name, value in lines:
-        console.print(printable(f"{name:<24} {value}"), soft_wrap=True)
+    _print_lines(console, lines, 24)
 
 
 def _model_value(value: Any) -> str:
@@ -224,7 +226,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key, ", ".join(f"{name or 'none'} ({count})" for name, count in found[key].items())))
     if found.get("unknown_labels"):
         lines.append(("unknown labels", str(found["unknown_labels"])))
-    lines += _skipped_lines(found.get("skipped", []))
+    lines += _first_lines("skipped", [f"{one['name']}: {one['reason']}" for one in found.get("skipped", [])])
     if found["kind"] == "views":
         lines += _view_lines(found)
     elif found["kind"] == "gaussians":
@@ -249,21 +251,18 @@ def _count(name: str, count: int) -> str:
 
 def _shift_lines(shifts: dict[str, list[float]]) -> list[tuple[str, str]]:
     """Returns the lines of shifts: added to the points of its sequence, a shift gives the original coordinates."""
-    lines = [
-        ("shift", f"{name}: {', '.join(f'{value:.10g}' for value in shift)} (points + shift: the original coordinates)")
-        for name, shift in list(shifts.items())[:_SKIPPED_SHOWN]
+    told = [
+        f"{name}: {', '.join(f'{value:.10g}' for value in shift)} (points + shift: the original coordinates)"
+        for name, shift in shifts.items()
     ]
-    if len(shifts) > _SKIPPED_SHOWN:
-        lines.append(("shift", f"... and {len(shifts) - _SKIPPED_SHOWN} more; --json lists all"))
-    return lines
+    return _first_lines("shift", told)
 
 
-def _skipped_lines(skipped: list[dict[str, str]]) -> list[tuple[str, str]]:
-    """Samples that were left out when the file was made, and why."""
-    lines = [("skipped", f"{entry['name']}: {entry['reason']}") for entry in skipped[:_SKIPPED_SHOWN]]
-    if len(skipped) > _SKIPPED_SHOWN:
-        lines.append(("skipped", f"... and {len(skipped) - _SKIPPED_SHOWN} more; --json lists all"))
-    return lines
+def _first_lines(name: str, told: list[str]) -> list[tuple[str, str]]:
+    """Returns a line for each of the first texts, all under one name, and one that counts the rest."""
+    if len(told) > _SAMPLES_SHOWN:
+        told = [*told[:_SAMPLES_SHOWN], f"... and {len(told) - _SAMPLES_SHOWN} more; --json lists all"]
+    return [(name, text) for text in told]
 
 
 def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:

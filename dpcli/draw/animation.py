@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.path_names import utf8_path
+from dpcli.path_names import frame_names, utf8_path
 from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import check_replaced, not_writable, refuse_broken_link, refuse_replacing, whole_file
 
@@ -208,5 +208,10 @@ def _folder(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     from PIL import Image
 
     path.mkdir()
+    paths = []
     for number, picture in enumerate(pictures):
-        Image.fromarray(picture).save(path / f"{number:04d}.png")
+        paths.append(path / f"{number:04d}.png")
+        Image.fromarray(picture).save(paths[-1])
+    for one, name in zip(paths, frame_names(range(len(paths)), ".png")):  # known only now that all are drawn
+        if one.name != name:
+            one.rename(path / name)

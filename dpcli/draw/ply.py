@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.draw.palette import part_colors
 from dpcli.draw.sequences import PointSequence
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import frame_names
 from dpcli.runtime.whole_file import check_replaced, make_folder, whole_file, write_whole
 
 _VERTEX = np.dtype(
@@ -47,7 +48,7 @@ def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
         raise UsageError(f"--ply {folder}: is a file, expected a folder for the frames")
     check_replaced(folder, ("[0-9]*.ply",))
     make_folder(folder.parent, "--ply")
-    offsets, names = sequence.frame_offsets, [f"{t:04d}.ply" for t in range(sequence.num_frames)]
+    offsets, names = sequence.frame_offsets, frame_names(range(sequence.num_frames), ".ply")
     with whole_file(folder) as part:
         make_folder(part, "--ply")
         for t, name in enumerate(names):

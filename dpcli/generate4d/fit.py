@@ -43,7 +43,10 @@ class FitRun:
         Raises DpcError when the loss is no longer finite, Stopped after a signal, once the state is saved.
         """
         state = self.folder.load_state()
-        self._restore(state) if state is not None else self._start()
+        if state is not None:
+            self._restore(state)
+        else:
+            self._start()
         self._counted = time.monotonic()
         with Progress("fit", self.steps, "step") as bar:
             bar.skip(self.optimizer.step)

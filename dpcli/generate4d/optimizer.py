@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dpcli.generate4d.config import FitConfig
 from dpcli.generate4d.priors.camera_sampling import novel_cameras
-from dpcli.generate4d.priors.interface import Prior
+from dpcli.generate4d.priors.interface import Prior, RelativeCamera
 from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
 from dpcli.generate4d.scene.control_points import ControlPoints
 from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
@@ -172,26 +172,32 @@ class SceneOptimizer:
     def _prior_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
         """Returns the prior's loss on random new views of the step's frames (C.11)."""
         size = min(max(self.targets.size), _PRIOR_SIZE)
-        cameras, poses, intrinsics = novel_cameras(self.targets, len(frames), size, rng)
+        cameras, poses, intrinsics = self._novel_cameras(len(frames), size, rng)
         white = torch.ones(len(frames), 3, device=self.device)
-        rendered, _, _ = self.model.render(
-            instant, poses.to(self.device), intrinsics.to(self.device), size, size, white
-        )
+        rendered, _, _ = self.model.render(instant, poses, intrinsics, size, size, white)
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
     def _shape_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
         """Returns the loss on the shape prior's pictures of the step's frames from random new sides."""
         config, size = self.config, min(self.config.shape_size, *self.targets.size)
-        _, poses, intrinsics = (
-            part.to(self.device) if isinstance(part, Tensor) else part
-            for part in novel_cameras(self.targets, len(frames), size, rng)
-        )
+        _, poses, intrinsics = self._novel_cameras(len(frames), size, rng)
         background = self._backgrounds(len(frames), rng)
         truth = self.shape.pictures(frames, poses, intrinsics, size)
         rendered, alpha, _ = self.model.render(instant, poses, intrinsics, size, size, background)
-        first, last = config.shape
-        weight = first * (last / first) ** (self.step / max(config.steps - 1, 1))
-        return config.reconstruction * weight * picture_loss(rendered, alpha, truth, background, _SHAPE_FOREGROUND)
+        weight = config.reconstruction * self._log_linear(config.shape)
+        return weight * picture_loss(rendered, alpha, truth, background, _SHAPE_FOREGROUND)
+
+    def _novel_cameras(
+        self, count: int, size: int, rng: torch.Generator
+    ) -> tuple[list[RelativeCamera], Tensor, Tensor]:
+        """Returns what `novel_cameras` does, on the fit's device."""
+        cameras, poses, intrinsics = novel_cameras(self.targets, count, size, rng)
+        return cameras, poses.to(self.device), intrinsics.to(self.device)
+
+    def _log_linear(self, ends: tuple[float, float]) -> float:
+        """Returns where a value stands at this step that goes log-linearly from its first to its last."""
+        first, last = ends
+        return first * (last / first) ** (self.step / max(self.config.steps - 1, 1))
 
     def _backgrounds(self, count: int, rng: torch.Generator) -> Tensor:  # [count, 3]
         """Returns backgrounds, each black or white, so that neither color can pass for transparency."""
@@ -252,12 +258,10 @@ class SceneOptimizer:
 
     def _set_learning_rates(self) -> None:
         """Sets the rates that fall log-linearly from their first value to their last."""
-        share = self.step / max(self.config.steps - 1, 1)
         falling = {"mean": self.config.rate_mean, "network": self.config.rate_network}
         for group in self.optimizer.param_groups:
             if group["name"] in falling:
-                first, last = falling[group["name"]]
-                group["lr"] = first * (last / first) ** share
+                group["lr"] = self._log_linear(falling[group["name"]])
 
     def _add_screen_gradient(self, notes: dict) -> None:
         gradient = notes["means2d"].grad

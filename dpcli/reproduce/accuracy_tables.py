@@ -39,6 +39,7 @@ STREAMS = ("static", "dynamic", "fused")
 MORE = (
     "--epochs 15 --set epochs_dynamic=40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
 )
+_RAW = "the data set's folder; - with --clouds"
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
 
@@ -266,8 +267,10 @@ def prepared(
     return files
 
 
-def add_data(parser: argparse.ArgumentParser) -> None:
-    """Adds the options that every network has."""
+def add_data(parser: argparse.ArgumentParser, raw: str = _RAW) -> None:
+    """Adds the data, whose help `raw` is, the folder of the results, and the options that every network has."""
+    parser.add_argument("raw", help=raw)
+    parser.add_argument("folder", type=Path)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--prepare", default="", help="more words for `dpc prepare`")
     parser.add_argument("--clouds", type=Path, help="a file of clouds to take instead of preparing RAW")
@@ -280,9 +283,9 @@ def clouds_of(given: argparse.Namespace, experiment: Experiment, run: Dpc) -> Pa
     )
 
 
-def add_plan(parser: argparse.ArgumentParser) -> None:
-    """Adds the options that every accuracy has."""
-    add_data(parser)
+def add_plan(parser: argparse.ArgumentParser, raw: str = _RAW) -> None:
+    """Adds what `add_data` does, and the options that every accuracy has."""
+    add_data(parser, raw)
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument(
         "--clips", type=int, help="per video at prediction, 0 = every start; 8, or 0 for thesis and release"
@@ -299,8 +302,6 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=list(EXPERIMENTS))
-    parser.add_argument("raw", help="the data set's folder; - with --clouds")
-    parser.add_argument("folder", type=Path)
     parser.add_argument("--only", default="", help="some of the table's settings: 16, bbox, xsub ...")
     parser.add_argument("--from", dest="first", help="3.4: the length whose network the others go on from; 16, or none")
     parser.add_argument("--more", default=MORE, help=f"3.4: how they go on; {MORE}")

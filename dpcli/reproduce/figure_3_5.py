@@ -270,8 +270,6 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", choices=list(DATA))
-    parser.add_argument("raw", help="the data set's folder; - with --clouds")
-    parser.add_argument("folder", type=Path)
     add_data(parser)
     parser.add_argument("--folds", type=int, default=10)
     parser.add_argument("--only", default="", help="some of the folds, from 0: 0,1,2")

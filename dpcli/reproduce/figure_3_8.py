@@ -281,14 +281,12 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("raw", help="folder of MSRAction-3D; - with --clouds or --profile-only")
-    parser.add_argument("folder", type=Path)
     parser.add_argument("--backbones", default=",".join(BACKBONES))
     parser.add_argument(
         "--flow", default="icp", help="a method of `dpc segment estimate-flow`, or a folder of `segment flow`"
     )
     parser.add_argument("--profile-only", action="store_true", help="parameters and operations, no training")
-    add_plan(parser)
+    add_plan(parser, "folder of MSRAction-3D; - with --clouds or --profile-only")
     given = parser.parse_args(own)
     backbones = given.backbones.split(",")
     if set(backbones) - set(BACKBONES):

@@ -146,8 +146,6 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", choices=list(DATA))
-    parser.add_argument("raw", help="the data set's folder; - with --clouds")
-    parser.add_argument("folder", type=Path)
     parser.add_argument("--modelnet", default="", help="folder modelnet40_ply_hdf5_2048")
     parser.add_argument("--pretrain", default="", help="more words for the training on ModelNet40, such as --epochs 20")
     add_plan(parser)

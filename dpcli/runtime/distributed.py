@@ -51,12 +51,8 @@ class Processes:
 def from_environment() -> Processes:
     """Returns what torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. Raises UsageError when they are no numbers."""
     try:
-        return Processes(
-            *(
-                int(os.environ.get(name, default))
-                for name, default in (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))
-            )
-        )
+        named = {"rank": "RANK", "count": "WORLD_SIZE", "local_rank": "LOCAL_RANK"}
+        return Processes(**{key: int(os.environ[name]) for key, name in named.items() if name in os.environ})
     except ValueError:
         raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is not a number; start with torchrun, or unset them") from None
 

@@ -264,11 +264,9 @@ def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
 
 
 def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
-    """Returns (name, reason) of the samples that were passed over when the file was made; DataError on a wrong shape."""
+    """Returns (name, reason) of the samples that were passed over when the file was made."""
     if "skipped" not in file:
         return []
-    if file["skipped"].ndim != 2 or file["skipped"].shape[1] != 2:
-        raise DataError(f"{file.filename}: skipped has shape {file['skipped'].shape}, expected (n, 2): name, reason")
     return [(str(name), str(reason)) for name, reason in file["skipped"].asstr()[:]]
 
 

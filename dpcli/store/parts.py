@@ -181,16 +181,18 @@ class PartsReader(CloudsReader):
         if "part" not in self.fields:
             raise absent(self.path, "part")
         probability = file.get("part_probability")
-        if probability is None or probability.ndim != 2 or len(probability) != self.num_points:
+        if probability is None or len(probability) != self.num_points:
             found = "is missing" if probability is None else f"has shape {probability.shape}"
             raise DataError(f"{self.path}: part_probability {found}, expected ({self.num_points}, parts)")
         self.num_parts = int(probability.shape[1])
-        self._pair_offsets = self._rising(file, "pair_offsets", len(self.names), len(self._data(file, "pair", (2,))))
+        self._pair_offsets = self._rising(file, "pair_offsets", len(self.names), len(self._data(file, "pair")))
         pairs = int(self._pair_offsets[-1])
-        self._flow_offsets = self._rising(file, "flow_offsets", pairs, len(self._data(file, "flow", (3,))))
-        motions = len(self._data(file, "part_motion", (self.num_parts, 4, 4)))
-        if motions != pairs:
-            raise DataError(f"{self.path}: part_motion has {motions} rows for {pairs} pairs")
+        self._flow_offsets = self._rising(file, "flow_offsets", pairs, len(self._data(file, "flow")))
+        motions = self._data(file, "part_motion").shape
+        if motions[1] != self.num_parts:
+            raise DataError(f"{self.path}: part_motion has shape {motions}, expected (n, {self.num_parts}, 4, 4)")
+        if motions[0] != pairs:
+            raise DataError(f"{self.path}: part_motion has {motions[0]} rows for {pairs} pairs")
 
     def _rising(self, file: h5py.File, name: str, spans: int, end: int) -> np.ndarray:
         offsets = self._offsets(file, name, None)

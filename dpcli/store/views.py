@@ -16,6 +16,7 @@ from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
     PACKED,
+    absent,
     history_of,
     open_store,
     read_provenance,
@@ -155,7 +156,7 @@ class ViewsWriter:
         try:
             self._create(seed, source, track, part)
         except BaseException as error:
-            self._atomic.failed(type(error), error, None)
+            self._atomic.failed(error)
             raise
 
     def _create(self, seed: int, source: str, track: np.ndarray | None, part: np.ndarray | None) -> None:
@@ -205,8 +206,8 @@ class ViewsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._atomic.failed(kind, error, trace)
+        if error is not None:
+            self._atomic.failed(error)
             return
         if not self._written.all():
             view, frame = np.argwhere(~self._written)[0]
@@ -236,14 +237,14 @@ class ViewsReader:
 
     def _load_header(self, file: h5py.File) -> ViewsHeader:
         for key in ("rgba", "intrinsics", "world_to_camera", "time"):
-            if key not in file or file[key].dtype.kind not in "fu":
-                raise DataError(f"{self.path}: data set {key!r} is missing or not numeric; make the file again")
+            if key not in file:
+                raise absent(self.path, key)
         for key in ("name", "reference"):
             if key not in file.attrs:
                 raise DataError(f"{self.path}: attribute {key!r} is missing; the file is incomplete, make it again")
         role, rgba = read_strings(file, "role"), file["rgba"]
         found = (len(role), len(file["time"]))
-        if rgba.dtype != np.uint8 or rgba.ndim != 5 or rgba.shape[:2] != found or rgba.shape[4] != 4:
+        if rgba.shape[:2] != found:
             raise DataError(
                 f"{self.path}: rgba is {rgba.dtype} {rgba.shape}, expected uint8 "
                 f"(views = {found[0]}, frames = {found[1]}, height, width, 4)"

@@ -150,7 +150,7 @@ def leaves(command):
 
 
 def test_no_option_takes_what_is_no_number():
-    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
+    checked = leaves(cli._checking(typer.main.get_command(cli.application())))
     numbers = [(leaf, one) for leaf in checked for one in leaf.params if "float" in str(one.type_descriptor.annotation)]
     assert len(numbers) > 60
     for leaf, one in numbers:
@@ -163,7 +163,7 @@ def test_no_option_takes_what_is_no_number():
 
 def test_no_option_takes_a_count_of_a_thousand_millions():
     """Seeds alone are no counts; settings have bounds of their own (test_settings_options.py)."""
-    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
+    checked = leaves(cli._checking(typer.main.get_command(cli.application())))
     counts = [(leaf, one) for leaf in checked for one in leaf.params if "int" in str(one.type_descriptor.annotation)]
     counts = [(leaf, one) for leaf, one in counts if one.type_descriptor.parameter_info.parser is None]
     assert len(counts) > 60

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.draw.animation import _folder, output_kind, write_pictures
 from dpcli.errors import DataError, DpcError, UsageError
 from tests.support.browser import held_page, needs_browser, open_page
 
@@ -69,6 +70,15 @@ def test_an_animation_lasts_as_long_as_asked_for_or_says_that_it_cannot(tmp_path
         pauses = [image.seek(frame) or image.info["duration"] for frame in range(image.n_frames)]
     assert sum(pauses) / 1000 == pytest.approx(seconds)
     assert ("at most 50 pictures a second: it takes 1.2 times as long" in capsys.readouterr().err) is (fps > 50)
+
+
+def test_the_order_of_many_pictures_is_that_of_their_names(tmp_path, monkeypatch):
+    """Shells and most programs sort names as text: 10000.png would come before 1001.png."""
+    monkeypatch.setattr(Image.Image, "save", lambda image, path: path.write_bytes(image.tobytes()))  # takes a tenth
+    _folder(tmp_path / "many", (np.full((1, 1, 3), 255 * (frame == 10_000), np.uint8) for frame in range(10_001)), 10)
+    names = sorted(path.name for path in (tmp_path / "many").iterdir())
+    assert len(names) == 10_001 and (names[0], names[-1]) == ("00000.png", "10000.png")
+    assert [(tmp_path / "many" / name).read_bytes() for name in names[-2:]] == [b"\0\0\0", b"\xff\xff\xff"]
 
 
 def test_nothing_half_made_stays(tmp_path):

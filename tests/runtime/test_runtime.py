@@ -7,12 +7,9 @@ import io
 import json
 import os
 import signal
-import struct
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,13 +21,7 @@ from dpcli.runtime.pool import LostWorker, ordered_map
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.weights import load_weights, save_weights
-
-
-def square(x: int) -> int:
-    if x == 3:
-        raise ValueError("three")
-    time.sleep(0.02 * (x % 3))  # later items finish first
-    return x * x
+from tests.support.worker_functions import die_at_three, die_once_at_three, die_writing_at_three, square
 
 
 @pytest.mark.parametrize(("apart", "works"), [(False, "--jobs 1"), (True, "--jobs 1 --item-seconds 0")])
@@ -43,35 +34,6 @@ def test_a_machine_whose_processes_share_nothing_is_told_what_works(apart, works
     monkeypatch.setattr(pool, "ProcessPoolExecutor", no_place)
     with pytest.raises(DpcError, match=rf"/dev/shm for them \(Read-only file system\); {works} needs none"):
         next(ordered_map(square, range(2), 1 if apart else 2, apart=apart))
-
-
-def die_at_three(x: int) -> int:
-    if x == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x
-
-
-def die_writing_at_three(item):
-    """Writes the first bytes of a result's length as `multiprocessing` does, and dies; the second time it returns."""
-    number, folder = item
-    if number == 3 and not any(Path(folder).iterdir()):
-        (Path(folder) / "died").touch()
-        frame = sys._getframe()
-        while "result_queue" not in frame.f_locals:
-            frame = frame.f_back
-        queue = frame.f_locals["result_queue"]
-        queue._wlock.acquire()
-        os.write(queue._writer.fileno(), struct.pack("!i", 99_999) + b"half of it")
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def die_once_at_three(item: tuple[int, str]) -> int:
-    x, folder = item
-    if x == 3 and not Path(folder, "died").exists():
-        Path(folder, "died").touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -133,7 +95,6 @@ def test_a_second_signal_exits_at_once():
     code = """
 import time
 from dpcli.runtime.signals import stop_requested
-from dpcli.runtime.weights import load_weights, save_weights
 with stop_requested() as stop:
     print("ready", flush=True)
     while not stop.requested:

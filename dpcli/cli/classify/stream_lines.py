@@ -33,10 +33,9 @@ class Lines:
 
         People read confidence, what the threshold is held against; plain probabilities are in the JSON beside it.
         """
-        seconds = latency
+        self.count_latency(latency)
         sure, nothing = self._sure(made.scores[0])
-        self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
-        latency = round(1000 * seconds, 1)  # ms from here on
+        latency = round(1000 * latency, 1)  # ms from here on
         if self.as_json:
             row = {
                 "frame": made.frame,
@@ -56,6 +55,10 @@ class Lines:
             f"frame {made.frame}: {said}{self._text(self.confidence.of(made.scores))}; {latency:.0f} ms{behind}",
             flush=True,
         )
+
+    def count_latency(self, seconds: float) -> None:
+        """Takes the latency of one prediction, printed or not, into the average at the end."""
+        self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """Prints the mean over all clips, (1+S,C), and how the stream ended."""

@@ -48,8 +48,7 @@ class View:
         best = int(probabilities.argmax())
         self.newest = probabilities, latency, waiting
         self.history.append(best if probabilities[best] >= self.speaker.confidence.threshold else -1)
-        self.lines.count += 1
-        self.lines.seconds, self.lines.highest = self.lines.seconds + latency, max(self.lines.highest, latency)
+        self.lines.count_latency(latency)
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """Ends the view and prints the line about the whole stream."""

@@ -13,7 +13,8 @@ from dpcli.cli.settings_options import options_of
 from dpcli.cli.spread_options import SpreadClips
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.generate4d.config import CATALOG, PRESETS
+from dpcli.generate4d.config import CATALOG, PRESETS, resolve_settings, unread_settings
+from dpcli.runtime.progress import log
 from dpcli.runtime.settings.catalog import Given
 
 
@@ -42,9 +43,6 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit a 4D scene to the pictures of each views file. Running again continues; SIGTERM saves first (exit 75)."""
-    from dpcli.generate4d.config import resolve_settings, unread_settings
-    from dpcli.runtime.progress import log
-
     config, supervision = resolve_settings(given)
     for line in unread_settings(given, config, supervision):
         log.warn(line)

@@ -15,7 +15,6 @@ from dpcli.generate4d.out.export import (
     export_sequence,
     keep_opaque,
     tables_beside,
-    write_clouds,
     write_json,
 )
 from dpcli.generate4d.out.formats import Axes, Format
@@ -24,7 +23,7 @@ from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.whole_file import refuse_existing
-from dpcli.store import CloudSequence, input_file, output_file
+from dpcli.store import CloudSequence, CloudsWriter, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
 
 _SPLATS = ("ply", "splat", "compressed.ply", "spz")  # one file for a file's name, one a frame for a folder's
@@ -70,16 +69,10 @@ def export_scene(
 def _export_clouds(
     sequence: CloudSequence, output: str, root: dict, history: list[dict], seed: int, force: bool
 ) -> None:
-    with output_file(output) as target:
-        write_clouds(
-            target,
-            sequence,
-            provenance=history,
-            source=str(root["source"]),
-            seed=seed,
-            length_unit=str(root["length_unit"]),
-            force=force,
-        )
+    fields = ["time", "color", "part", "track", *(["pose"] if sequence.pose is not None else [])]
+    origin = {"source": str(root["source"]), "length_unit": str(root["length_unit"]), "provenance": history}
+    with output_file(output) as target, CloudsWriter(target, fields=fields, seed=seed, force=force, **origin) as writer:
+        writer.write(sequence)
     log.info(f"{counted(sequence.num_frames, 'frame')} of {counted(len(sequence.frame(0)), 'point')}")
 
 

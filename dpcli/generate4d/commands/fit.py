@@ -76,14 +76,15 @@ def fit_scene(
         if targets.num_views > 1:
             check_cameras(targets, views)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
-        prior, shape = (
-            _load_prior(supervision, targets, device),
-            guide(supervision.prior, targets, supervision.prior_model),
-        )
+        prior = _load_prior(supervision, targets, device)
+        shape = guide(supervision.prior, targets, supervision.prior_model)
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
-        model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
+        settings = CATALOG.to_toml({"fit": config, "supervision": supervision}, "generate4d fit")
+        model, metrics = _optimize(optimizer, folder, settings)
         scene = to_scene(model, targets, metrics, calm=shape is not None)
-        _write(output, scene, targets, entry, seed, force)
+        origin = {"source": targets.name, "length_unit": targets.length_unit, "provenance": [*targets.history, entry]}
+        with output_file(output) as place:
+            write_scene(place, scene, seed=seed, force=force, **origin)
         if picture is not None:
             write_preview(scene, targets, picture)  # its parts are those of the file
     log.info(
@@ -100,10 +101,6 @@ def _tell_faint(scene: GaussianScene) -> None:
             f"no Gaussian is {POINT_OPACITY} opaque or more, the most opaque has {most:.2g}: hardly anything of the object is seen, "
             "whatever the PSNR; fit larger pictures (--size) or for more steps, of a clip in which the object is larger"
         )
-
-
-def _groups(config: FitConfig, supervision: Supervision) -> dict[str, Any]:
-    return {"fit": config, "supervision": supervision}
 
 
 def _record(views: Path, config: FitConfig, supervision: Supervision, seed: int) -> dict[str, Any]:
@@ -148,19 +145,6 @@ def _optimize(optimizer: SceneOptimizer, folder: RunFolder, settings: str) -> tu
     named = {f"psnr_{view}": round(value, 3) for view, value in fitted_psnr(model, targets).items()}
     counts = {"gaussians": len(model.gaussians), "seconds": round(fit.seconds, 1), "steps": optimizer.step}
     return model, {**named, **counts}
-
-
-def _write(output: str, scene: GaussianScene, targets: Targets, entry: dict, seed: int, force: bool) -> None:
-    with output_file(output) as place:
-        write_scene(
-            place,
-            scene,
-            seed=seed,
-            source=targets.name,
-            provenance=[*targets.history, entry],
-            length_unit=targets.length_unit,
-            force=force,
-        )
 
 
 def _device(name: str, prior: str) -> str:

@@ -77,8 +77,9 @@ def fit_clips(
                 raise result
             else:
                 fitted.scenes.append(scene)
-            log.info(f"fitted: {len(fitted.scenes)} of {counted(len(mine), 'clip')}")
-            stop.check(f"fitted: {len(fitted.scenes)} of {counted(len(mine), 'clip')}")
+            done = f"fitted: {len(fitted.scenes)} of {counted(len(mine), 'clip')}"
+            log.info(done)
+            stop.check(done)
     return fitted
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.whole_file import check_target
 from dpcli.store import ViewsReader, input_file, output_file
 from dpcli.store.gaussians import read_scene, scene_origin
-from dpcli.store.views import ViewsHeader
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _CAMERA = ("azimuth", "elevation", "radius", "fovy")
@@ -62,7 +60,10 @@ def render_scene(
             header = reader.header
         span = f"{header.time[0]:.4g} to {header.time[-1]:.4g} s; was it fitted to another clip?"
         scene.require_times(header.time, scene_file, f"{cameras} has frames from {span}")
-        _render_views(renderer, look, header, str(output), [*history, entry], root, force)
+        origin = {"source": str(root["source"]), "seed": int(root["seed"]), "provenance": [*history, entry]}
+        with output_file(str(output)) as place:
+            render_views(renderer, header, place, look, force=force, **origin)
+        log.info(f"{output}: {counted(header.num_views, 'view')} x {counted(header.num_frames, 'frame')}")
     elif output is not None:
         _render_path(renderer, look, Path(output), settings, force, has_sheet=picture is not None)
     if picture is not None:
@@ -117,29 +118,6 @@ def _render_path(
         write_pictures(output, draw(), settings.fps or default_rate(renderer.scene, path), force=force)
     width, height = (side + side % 2 if kind == ".mp4" else side for side in shots[0].size)  # as H.264 needs them
     log.info(f"{output}: {counted(len(shots), 'picture')} of {width} x {height}")
-
-
-def _render_views(
-    renderer: Renderer,
-    look: Look,
-    header: ViewsHeader,
-    output: str,
-    history: list[dict],
-    root: dict[str, Any],
-    force: bool,
-) -> None:
-    with output_file(output) as place:
-        render_views(
-            renderer,
-            header,
-            place,
-            look,
-            provenance=history,
-            source=str(root["source"]),
-            seed=int(root["seed"]),
-            force=force,
-        )
-    log.info(f"{output}: {counted(header.num_views, 'view')} x {counted(header.num_frames, 'frame')}")
 
 
 def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: RenderSettings) -> None:

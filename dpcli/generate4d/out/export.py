@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
+from dpcli.path_names import frame_names
 from dpcli.runtime.whole_file import (
     check_replaced,
     not_writable,
@@ -21,7 +21,7 @@ from dpcli.runtime.whole_file import (
     whole_file,
     write_whole,
 )
-from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store import CloudSequence
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
 POINT_OPACITY = 0.3  # least opacity of a Gaussian that is a point of the object
@@ -73,8 +73,7 @@ def export_sequence(
         refuse_replacing(path, force)
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
-    width = max(4, len(str(scene.num_frames)))
-    names = [f"frame{number:0{width}d}.{form}" for number in range(1, scene.num_frames + 1)]
+    names = frame_names(range(1, scene.num_frames + 1), f".{form}", "frame")
     try:
         with whole_file(folder) as part:
             _make_folder(part, folder)
@@ -140,21 +139,3 @@ def as_sequence(
     return CloudSequence.from_frames(
         name, list(frames), time=scene.time, pose=pose, **{key: [value] * count for key, value in per_point.items()}
     )
-
-
-def write_clouds(
-    path: Path,
-    sequence: CloudSequence,
-    *,
-    provenance: Sequence[dict],
-    source: str,
-    seed: int,
-    length_unit: str = "",
-    force: bool = False,
-) -> None:
-    """Writes a `clouds` file of one sequence."""
-    fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
-    with CloudsWriter(
-        path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force
-    ) as writer:
-        writer.write(sequence)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.generate4d.out.splat_files import Splats
-from dpcli.runtime.whole_file import write_whole
+from dpcli.runtime.whole_file import not_writable, whole_file, write_whole
 
 _BITS = (16, 12, 8, 4)  # of 24 a coordinate, behind the point: steps of 1/65536, of 1/4096 ...
 _LOG_SIZES = -10.0, 5.95  # logarithms of the least and the largest size, which is written as a byte of sixteenths
@@ -46,11 +45,13 @@ def write_spz(path: Path, splats: Splats) -> None:
             f"{path}: .spz holds sizes of {bounds[0]:.2g} to {bounds[1]:.3g}, but the Gaussians have {own[0]:.2g} to {own[1]:.3g};"
             " write --as compressed.ply or ply"
         )
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "scene.spz"
-        gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits)
-        packed = gzip.decompress(place.read_bytes())
-    write_whole(path, gzip.compress(packed, mtime=0))  # equal scenes give equal bytes
+    try:
+        with whole_file(path) as part:
+            gsply.write_spz(part, _data(gsply, splats), fractional_bits=bits)
+            content = gzip.decompress(part.read_bytes())
+            part.write_bytes(gzip.compress(content, mtime=0))  # equal scenes give equal bytes
+    except OSError as error:
+        raise not_writable(path, error) from None
 
 
 def _gsply(path: Path) -> Any:

@@ -92,7 +92,7 @@ def sample_surface(
         raise DataError(
             "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
         )
-    ray = points.position + camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
+    ray = points.position - camera.center
     depth = ray @ camera.world_to_camera[2, :3]
     facing = np.abs((ray * points.normal).sum(1)) / np.linalg.norm(ray, axis=1)
     area = depth**2 / facing.clip(0.15)

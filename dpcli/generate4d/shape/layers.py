@@ -38,6 +38,11 @@ class Camera:
         return np.stack([x * depth, y * depth, depth], -1)
 
     @property
+    def center(self) -> np.ndarray:
+        """Returns where the camera stands in the world, f64 (3)."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
     def distance(self) -> float:
         """Returns the depth of the world's origin, about which the object is centered."""
         return float(self.world_to_camera[2, 3])

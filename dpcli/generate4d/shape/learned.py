@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -61,16 +61,16 @@ class Network:
         """Returns the layers of each frame; see `ShapePrior.layers`."""
         found = [_place(picture[3] > 0.5) for picture in pictures]
         shown = [index for index, place in enumerate(found) if place is not None]
-        empty = [_empty(picture, camera) for picture in pictures]
+        layers = [_empty(picture, camera) for picture in pictures]
         if not shown:
-            return empty
+            return layers
         cut = torch.stack([_shrink(pictures[index], found[index], self._size) for index in shown])
         depth, second, sure = self._predict(cut)
         for row, index in enumerate(shown):
-            empty[index] = _expand(
+            layers[index] = _expand(
                 depth[row], second[row], cut[row, 3], pictures[index], found[index], camera, sure[row]
             )
-        return empty
+        return layers
 
     def _predict(self, cut: Tensor) -> tuple[Tensor, Tensor, list[float]]:
         """Returns depth (T,4,S,S) in sides of the cut-outs (T,5,S,S), probability of a second interval, and confidences.
@@ -193,7 +193,7 @@ def _expand(
     depth = camera.distance + unit * _in_order(values[:4])
     layers.depth[:, rows, columns] = np.maximum(depth, NEAREST * camera.distance)
     layers.presence[1, rows, columns] = values[4] * picture[3, rows, columns]
-    return ShapeLayers(layers.depth, layers.presence, layers.color, confidence)
+    return replace(layers, confidence=confidence)
 
 
 def _in_order(depth: np.ndarray) -> np.ndarray:

@@ -46,9 +46,8 @@ def splats_of(layers: ShapeLayers, camera: Camera) -> Splats:
     from scipy.spatial.transform import Rotation
 
     points = points_of(layers, camera)
-    to_camera = camera.world_to_camera
-    ray = points.position - (-to_camera[:3, :3].T @ to_camera[:3, 3])
-    depth = ray @ to_camera[2, :3]
+    ray = points.position - camera.center
+    depth = ray @ camera.world_to_camera[2, :3]
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
     facing = (ray * points.normal).sum(1, keepdims=True)
     across = np.cross(points.normal, ray)

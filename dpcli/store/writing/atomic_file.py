@@ -96,7 +96,7 @@ class AtomicFile:
         if error is None:
             self.commit()
         else:
-            self.failed(kind, error, trace)
+            self.failed(error)
 
     def problem(self, error: BaseException | None, kept: str = "") -> DpcError | None:
         """Returns a DpcError for a write that found the disk full, None when `error` is something else.
@@ -131,15 +131,8 @@ class AtomicFile:
             put_in_place(self.part, self.target)
             self._unlock()
         except (OSError, RuntimeError) as error:
-            worded = self.problem(error, kept)
-            if worded is not None:
-                self._let_go()
-            if worded is None or not kept:
-                self.discard()
-            else:
-                self._close()
-                self._unlock()
-            raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
+            self.failed(error, kept if self.problem(error) else "")
+            raise DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def discard(self) -> None:
         """Closes and removes the unfinished file."""
@@ -153,9 +146,7 @@ class AtomicFile:
         except (OSError, RuntimeError):  # closing flushes, which fails again on a full disk
             pass
 
-    def failed(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, kept: str = ""
-    ) -> None:
+    def failed(self, error: BaseException, kept: str = "") -> None:
         """Discards after an exception, or keeps the part unfinished where `kept` says why; re-raises a failed write in words."""
         worded = self.problem(error, kept)
         if worded is not None:

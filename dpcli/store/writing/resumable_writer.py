@@ -111,7 +111,7 @@ class ResumableWriter(ABC):
             full = earlier and not force and disk_full(self.path, error, _STILL_KEPT)
             self._give_up(before)
             try:
-                self._leave(type(error), error, None)
+                self._leave(error)
             except DiskFull:
                 if not full:
                     raise
@@ -161,21 +161,19 @@ class ResumableWriter(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
+        if error is None:
             self._finish()
         else:
-            self._leave(kind, error, trace)
+            self._leave(error)
 
-    def _leave(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _leave(self, error: BaseException) -> None:
         """Removes all but, after a stop, the journal and the file it points into."""
         stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep or disk_full(self.path, error)
         kept = self._kept() if stopped else ""
         if hasattr(self, "_atomic"):
             self._atomic.needed = self._needed()
             try:
-                self._atomic.failed(kind, error, trace, kept)
+                self._atomic.failed(error, kept)
             finally:
                 self._leave_journal(bool(kept))
 
@@ -204,14 +202,13 @@ class ResumableWriter(ABC):
             # last, since a stream knows only at its end how many frames its provenance has to name
             write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
         except BaseException as error:
-            self._leave(type(error), error, None)
+            self._leave(error)
             raise
         self._atomic.needed = self._needed()
         try:
             self._atomic.commit(self._kept())
-        except (
-            DpcError
-        ) as error:  # unless the disk was full, the HDF5 file is gone, and with it what the journal points to
+        except DpcError as error:
+            # unless the disk was full, the HDF5 file is gone, and with it what the journal points to
             self._leave_journal(isinstance(error, DiskFull) and bool(self._kept()))
             raise
         self._leave_journal(kept=False)

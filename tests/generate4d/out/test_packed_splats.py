@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import os
 import struct
@@ -18,6 +19,7 @@ from dpcli.generate4d.commands.export import export_scene
 from dpcli.generate4d.out.export import export_file
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import Splats
+from dpcli.runtime.whole_file import DiskFull
 from dpcli.store.gaussians import GaussianScene, write_scene
 from tests.support.scenes import toy_scene
 
@@ -189,6 +191,17 @@ def test_equal_scenes_give_equal_bytes_and_a_missing_library_is_named(write, suf
     monkeypatch.setitem(sys.modules, "gsply", None)
     with pytest.raises(DataError, match=r"dpc-toolkit\[splats\]"):
         write(tmp_path / f"c.{suffix}", Splats.of(scene))
+
+
+@pytest.mark.parametrize(("write", "suffix"), [(write_spz, "spz"), (write_compressed_ply, "compressed.ply")])
+def test_a_full_disk_is_told_by_the_name_of_the_file(write, suffix, scene, tmp_path, monkeypatch):
+    def full(path: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(DiskFull, match=f"a.{suffix}: no space left"):
+        write(tmp_path / f"a.{suffix}", Splats.of(scene))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("form", ["spz", "compressed.ply"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -143,15 +143,13 @@ def open_window(
     drawn = torch.device(device).type == "cpu"
     first = min(kept, _FIRST) - 1
     at += first
-    made = ordered_map(partial(_make, make, count, drawn), range(max(at - kept + 1, 0), end + first), jobs)
-    try:
+    numbers = range(max(at - kept + 1, 0), end + first)
+    with closing(ordered_map(partial(_make, make, count, drawn), numbers, jobs)) as made:
         whole = (_whole(result) for _, result in made)
         window = Window(whole if drawn else (draw_round(models, device) for models in whole), kept)
         for _ in range(min(at, kept - 1)):
             window.advance()
         yield window
-    finally:
-        made.close()  # type: ignore[attr-defined]
 
 
 def _whole(result: Any) -> Any:
