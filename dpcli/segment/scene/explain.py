@@ -12,7 +12,7 @@ from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
 from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
-from dpcli.segment.scene.tracking import MovingObject, extended
+from dpcli.segment.scene.tracking import MovingObject, motion_from_to
 from dpcli.segment.scene.world import Frame, World
 
 _SURE = 50.0  # points explained better that make an object two thirds surer
@@ -47,10 +47,7 @@ class SceneExplanation:
 
         An object that was not met in one of the two frames keeps its motion between the nearest frames it was met in.
         """
-        own = np.eye(4)
-        if part > 0:
-            known = self.objects[part - 1]
-            own = extended(known, target) @ np.linalg.inv(extended(known, source))
+        own = motion_from_to(self.objects[part - 1], source, target) if part > 0 else np.eye(4)
         return np.linalg.inv(self.pose[target]) @ own @ self.pose[source]
 
 
