@@ -54,14 +54,8 @@ def grouped_mlp(
     Differentiable in features, weights, biases and norms; not in positions. The fast path takes float32, C1 in eights and
     C2 of 8 or more. Raises ValueError, on CPU, on an index out of range.
     """
-    fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
-    fast = (
-        fast
-        and len(norm1.weight) % _LANES == 0
-        and len(norm2.weight) >= _LANES
-        and not torch.is_autocast_enabled(points.device.type)
-    )
-    if fast:
+    fits = len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES
+    if fits and norm1.mean is None and _by_kernel(points):
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     if norm1.mean is not None and norm2.mean is not None and not torch.is_grad_enabled():
         pooled = frozen_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)[1]
@@ -106,16 +100,17 @@ def frozen_activations(
 ) -> tuple[list[Tensor], Tensor]:
     """Computes as `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
     with torch.no_grad():
-        plain = (
-            points.dtype != torch.float32
-            or chosen_backend(points.device) != "numba"
-            or torch.is_autocast_enabled("cpu")
-        )
-        if plain or len(norm2.weight) % _LANES:
+        if len(norm2.weight) % _LANES or not _by_kernel(points):
             taps, _ = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
             return taps, taps[1].amax(2)
         folded = _folded(linear1, norm1), _folded(linear2, norm2)
         return _frozen_pieces(points.contiguous(), centers.contiguous(), idx.contiguous(), features, *folded)
+
+
+def _by_kernel(points: Tensor) -> bool:
+    """Returns whether the CPU form can take points: of float32, outside mixed precision."""
+    plain = points.dtype == torch.float32 and not torch.is_autocast_enabled(points.device.type)
+    return plain and chosen_backend(points.device) == "numba"
 
 
 def _frozen_pieces(
@@ -133,10 +128,8 @@ def _frozen_pieces(
         inputs = (points.numpy(), centers.numpy(), idx.numpy(), linear1[0].t().contiguous().numpy(), linear1[1].numpy())
     else:
         make = kernels.hidden_table
-        inputs = (
-            *(tensor.contiguous().numpy() for tensor in _project(points, centers, features, linear1)),
-            idx.numpy(),
-        )
+        projected = _project(points, centers, features, linear1)
+        inputs = (*(tensor.contiguous().numpy() for tensor in projected), idx.numpy())
     (clouds, count, neighbors), widths = idx.shape, (len(linear1[1]), len(linear2[1]))
     hidden, wide = (torch.empty(idx.numel(), width) for width in widths)
     best, weight, bias = torch.empty(clouds * count, widths[1]), linear2[0].t(), linear2[1].numpy()
@@ -202,7 +195,7 @@ class _GroupedMLP(torch.autograd.Function):
     def forward(ctx, points, centers, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):
         first = _FromPositions(points, centers, idx, weight1, bias1)
         if table is not None:
-            first = _FromTable(points, centers, idx, table.detach(), offset.detach(), weight1)
+            first = _FromTable(centers, idx, table.detach(), offset.detach(), weight1)
         mean1, var1 = first.statistics()
         first.fold(g1.detach() * torch.rsqrt(var1 + eps1), torch.rsqrt(var1 + eps1), b1.detach())
         signs = torch.where(g2 < 0, -1.0, 1.0)  # of the largest or smallest values, whichever the norm makes largest
@@ -232,23 +225,8 @@ class _GroupedMLP(torch.autograd.Function):
         parts = scale2[:, None] * _back_pool(ctx.first, pooled, weight2 * scale2[:, None], mixed, constant)
         grad_w2 = parts - torch.outer(shift, total.float()) - v[:, None] * (weight2 @ gram.float())
         table, offset, weight1, bias1, grad_g1, grad_b1 = ctx.first.gradients()
-        return (
-            None,
-            None,
-            None,
-            table,
-            offset,
-            weight1,
-            bias1,
-            grad_g1,
-            grad_b1,
-            grad_g2,
-            grad_b2,
-            grad_w2,
-            torch.zeros_like(bias2),
-            None,
-            None,
-        )
+        norms = (grad_g1, grad_b1, grad_g2, grad_b2)
+        return None, None, None, table, offset, weight1, bias1, *norms, grad_w2, torch.zeros_like(bias2), None, None
 
 
 class _FromPositions:
@@ -306,7 +284,7 @@ class _FromPositions:
 class _FromTable:
     """Computes a first layer as a difference of projected points and centers: table[j] - offset[i], offset = W_x center."""
 
-    def __init__(self, points, centers, idx, table: Tensor, offset: Tensor, weight: Tensor) -> None:
+    def __init__(self, centers: Tensor, idx: Tensor, table: Tensor, offset: Tensor, weight: Tensor) -> None:
         self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
         self.idx, self.rows, self.channels = idx, idx.numel(), table.shape[2]
         self.centers, self.weight_x = centers, weight.detach()[:, :3].t().contiguous()  # (3,C)

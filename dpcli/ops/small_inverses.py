@@ -34,10 +34,7 @@ def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "s
     [[1.0, -1.0], [-1.0, 2.0]]
     """
     _check(matrices, guard)
-    n = matrices.shape[-1]
-    if n > _BLOCKS:
-        return _cholesky_inverse(matrices, min_det, guard)
-    if n <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
+    if matrices.shape[-1] <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
         return _KernelInverse.apply(matrices, min_det, guard)
     return _inverse(matrices, min_det, guard)
 
@@ -45,8 +42,6 @@ def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "s
 def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
     """Computes `small_inverse` in plain torch, as a reference: same arguments, same guard."""
     _check(matrices, guard)
-    if matrices.shape[-1] > _BLOCKS:
-        return _cholesky_inverse(matrices, min_det, guard)
     return _inverse(matrices, min_det, guard)
 
 
@@ -131,7 +126,7 @@ def _inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
         rows = m.reshape(-1, n * n).t().contiguous().unbind(0)  # contiguous: strided entries cost twice the time
         adjugate, det = (_adjugate1, _adjugate2, _adjugate3, _adjugate4)[n - 1](*rows)
         return (torch.stack(adjugate) / _guarded(det, min_det, guard)).t().reshape(m.shape)
-    return _block_inverse(m, min_det, guard)
+    return (_block_inverse if n <= _BLOCKS else _cholesky_inverse)(m, min_det, guard)
 
 
 def _block_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:

@@ -61,16 +61,18 @@ def predict_parts(
     tracks = _tracks_of(sequence) if isinstance(segmenter, MultibodySegmenter) and segmenter.by_tracks else None
     frames = _prepare_frames(clouds, options, seed, tracks)
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
-    pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
+    known = [q for q, (i, j) in enumerate(reported) if i in place and j in place]
+    pairs = [(place[i], place[j]) for i, j in (reported[q] for q in known)]
     masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options, sequence.name)
     full = masks
     if frames.tracks is None:
         full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
-    motion, flow = _in_input_units(frames, masks, full, motions, pairs)
-    if len(pairs) < len(reported):
-        known = [(frames.numbers[i], frames.numbers[j]) for i, j in pairs]
-        motion, flow = _add_still_pairs(reported, known, clouds, motion, flow)
+    motion = np.tile(np.eye(4, dtype=np.float32), (len(reported), masks[0].shape[1], 1, 1))
+    flow = [np.zeros_like(clouds[i]) for i, _ in reported]
+    for q, (i, _), own in zip(known, pairs, motions):
+        motion[q] = motion_in_input_units(own, masks[i], frames.scale, torch.from_numpy(frames.center))
+        flow[q] = part_flow(frames.whole[i], full[i], own, frames.scale)
     probability = torch.cat(full).numpy().astype(np.float32)
     return labels, PartsSample(probability, np.array(reported, np.int32).reshape(-1, 2), motion, flow)
 
@@ -234,27 +236,3 @@ def _carry_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
         return mask
     spread = torch.cat([three_nn_interpolate(part[None], thin[None], mask[None])[0] for part in cloud.split(_CHUNK)])
     return spread / spread.sum(1, keepdim=True).clamp(min=1e-12)
-
-
-def _in_input_units(
-    frames: _Frames, masks: list[Tensor], full: list[Tensor], motions: list[tuple[Tensor, Tensor]], pairs: Pairs
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns motions f32 (Q,S,4,4) in the input's own coordinates and the flow of all points, pair by pair."""
-    slots, center = masks[0].shape[1], torch.from_numpy(frames.center)
-    motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
-    for q, ((i, _), own) in enumerate(zip(pairs, motions)):
-        flow.append(part_flow(frames.whole[i], full[i], own, frames.scale))
-        motion[q] = motion_in_input_units(own, masks[i], frames.scale, center)
-    return motion, flow
-
-
-def _add_still_pairs(
-    reported: Pairs, known: Pairs, clouds: list[np.ndarray], motion: np.ndarray, flow: list[np.ndarray]
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns motions (Q,S,4,4) and flows of all reported pairs: those that are not known stand still."""
-    motions = np.tile(np.eye(4, dtype=np.float32), (len(reported), motion.shape[1], 1, 1))
-    flows = [np.zeros_like(clouds[i]) for i, _ in reported]
-    place = {pair: number for number, pair in enumerate(reported)}
-    for pair, own, own_flow in zip(known, motion, flow):
-        motions[place[pair]], flows[place[pair]] = own, own_flow
-    return motions, flows

@@ -355,12 +355,8 @@ def back_norm(grad, table, reach, weight, mean, scale, t0, t1):
     batch, count, channels = grad.shape
     for row in prange(batch * count):
         b, j = np.uintp(row // count), np.uintp(row % count)
-        n, x, y, z = (
-            np.float32(reach[b, j, 0]),
-            np.float32(reach[b, j, 1]),
-            np.float32(reach[b, j, 2]),
-            np.float32(reach[b, j, 3]),
-        )
+        n, x = np.float32(reach[b, j, 0]), np.float32(reach[b, j, 1])
+        y, z = np.float32(reach[b, j, 2]), np.float32(reach[b, j, 3])
         for c in range(np.uintp(channels)):
             away = weight[0, c] * x + weight[1, c] * y + weight[2, c] * z
             value = n * (table[b, j, c] - mean[c]) - away

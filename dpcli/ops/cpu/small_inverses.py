@@ -143,6 +143,15 @@ def _invert(m, out, left, right, det, moved, min_det, guard):
 
 
 @arithmetic_kernel
+def _workspace(n, like):
+    """Returns what `_invert` works on, of the type of an array: tile and out (n,n,W), left, right, det, and moved (W)."""
+    half = n if n <= 4 else (n + 1) // 2
+    tile, out = np.empty((n, n, TILE), like.dtype), np.empty((n, n, TILE), like.dtype)
+    left, right = np.empty((n - half, half, TILE), like.dtype), np.empty((half, n - half, TILE), like.dtype)
+    return tile, out, left, right, np.empty((2, TILE), like.dtype), np.empty(TILE, np.bool_)
+
+
+@arithmetic_kernel
 def _load(matrices, first, size, tile, transposed):
     """Loads matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
     n = tile.shape[0]
@@ -171,15 +180,8 @@ def _store(tile, matrices, first, size):
 @arithmetic_kernel
 def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
     """Inverts matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
-    n = matrices.shape[1]
-    half = n if n <= 4 else (n + 1) // 2
-    tile = np.empty((n, n, TILE), matrices.dtype)
-    out = np.empty((n, n, TILE), matrices.dtype)
-    left = np.empty((n - half, half, TILE), matrices.dtype)
-    right = np.empty((half, n - half, TILE), matrices.dtype)
-    det = np.empty((2, TILE), matrices.dtype)
     floor = matrices.dtype.type(min_det)
-    acted = np.empty(TILE, np.bool_)
+    tile, out, left, right, det, acted = _workspace(matrices.shape[1], matrices)
     for low in range(first, last, TILE):
         size = min(TILE, last - low)
         _load(matrices, low, size, tile, False)
@@ -273,10 +275,8 @@ def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
     planes (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse.
     """
     n = places.shape[0]
-    half = n if n <= 4 else (n + 1) // 2
-    tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
-    left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
-    det, acted, sides = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((1, n, TILE), np.float32)
+    tile, out, left, right, det, acted = _workspace(n, moments)
+    sides = np.empty((1, n, TILE), np.float32)
     side, solved, count = sides[0], np.empty((n, TILE), np.float32), planes.size // n
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
@@ -306,10 +306,8 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
     (`ops.small_inverses.correct_guarded_gradients`).
     """
     n = places.shape[0]
-    half = n if n <= 4 else (n + 1) // 2
-    tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
-    left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
-    det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
+    tile, out, left, right, det, acted = _workspace(n, moments)
+    side = np.empty((n, TILE), np.float32)
     given, both_sides = np.empty((n, TILE), np.float32), np.empty((2, n, TILE), np.float32)
     x, u, count = both_sides[0], both_sides[1], grad.size // n
     for low in range(0, count, TILE):

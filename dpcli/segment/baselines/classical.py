@@ -78,7 +78,7 @@ def _label_frame(
     if len(kept) == len(points):
         return parts
     space = _join_features(points, motion, 1.0)
-    return parts[find_nearest(space[kept], space)]
+    return parts[find_nearest(space[kept], space)[1]]
 
 
 def _cluster(
@@ -122,12 +122,12 @@ def _merge_parts(parts: np.ndarray, points: np.ndarray, smallest: float, most: i
     if (parts < 0).all():
         return np.zeros(len(parts), np.int64)
     inside = np.flatnonzero(parts >= 0)
-    parts = parts[inside][find_nearest(points[inside], points)]
+    parts = parts[inside][find_nearest(points[inside], points)[1]]
     while True:
         ids, parts, counts = np.unique(parts, return_inverse=True, return_counts=True)
         least = int(np.argmin(counts))
         if len(ids) == 1 or (len(ids) <= most and counts[least] >= smallest):
             return parts.astype(np.int64)
         others, members = np.flatnonzero(parts != least), np.flatnonzero(parts == least)
-        index, distance = find_nearest(points[others], points[members], with_distance=True)
+        distance, index = find_nearest(points[others], points[members])
         parts[members] = parts[others[index[np.argmin(distance)]]]

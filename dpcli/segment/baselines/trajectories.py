@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -94,7 +93,7 @@ def _carried_labels(frames: Sequence[np.ndarray], flows: Flows, before: int, t: 
         source = source + flows[before, t]
     elif (t, before) in flows:
         query = query + flows[t, before]
-    return labels[find_nearest(source, query)]
+    return labels[find_nearest(source, query)[1]]
 
 
 def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -111,9 +110,8 @@ def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
     return ids
 
 
-def find_nearest(points: np.ndarray, query: np.ndarray, with_distance: bool = False) -> Any:
-    """Returns the index of the nearest of points (N,D) for every query (M,D); with its distance, if asked for."""
+def find_nearest(points: np.ndarray, query: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the distances (M) to the nearest of points (N,D) from every query (M,D), and their indices (M)."""
     from scipy.spatial import cKDTree
 
-    distance, index = cKDTree(points).query(query)
-    return (index, distance) if with_distance else index
+    return cKDTree(points).query(query)

@@ -80,12 +80,11 @@ def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, devi
     estimator in the points drawn from it, as it was trained. Zero in a single frame and toward a frame without points.
     """
     frames = [drawn.frame(t) for t in range(drawn.num_frames)]
+    if len(frames) == 1:
+        return np.zeros_like(drawn.points)
     targets = whole if flow in METHODS else frames
-    last = len(frames) - 1
-    flows = [
-        _frame_flow(frames[t], targets[t + 1 if t < last else t - 1], flow, device) for t in range(last + 1) if last
-    ]
-    return np.concatenate(flows).astype(np.float32, copy=False) if last else np.zeros_like(drawn.points)
+    pairs = zip(frames, [*targets[1:], targets[-2]])
+    return np.concatenate([_frame_flow(*pair, flow, device) for pair in pairs]).astype(np.float32, copy=False)
 
 
 def _frame_flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.ndarray:

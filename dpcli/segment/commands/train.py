@@ -56,12 +56,13 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
         torch.manual_seed(seed)
         model = _start_network(config, used.get("init_weights"), folder).to(chosen)
         model.mixed = mixed
+        predicted = isinstance(reader, PartsReader)
         notes = {
             "command": provenance.command_line(),
             "data": record["data"],
             "seed": seed,
-            "supervised": supervised and not isinstance(reader, PartsReader),
-            **({"labels": "predicted"} if isinstance(reader, PartsReader) else {}),
+            "supervised": supervised and not predicted,
+            **({"labels": "predicted"} if predicted else {}),
             "flow": settings.run.flow,
             "trained_on": f"{len(learned)} sequences, {len(training.pairs)} pairs",
         }
@@ -70,8 +71,7 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
             f" {settings.schedule.epochs} epochs"
         )
         keep_freed_memory()
-        flow = partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow), device=str(chosen))
-        estimate = None if supervised else flow
+        estimate = partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow), device=str(chosen))
         with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
             folder.write_settings(CATALOG.to_toml(settings._asdict(), "segment train"))
             Trainer(model, folder, settings, training, validation, estimate, notes, stop, seed).run()

@@ -105,13 +105,8 @@ class FlowStep3D(nn.Module):
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
-    def forward(
-        self, points1: Tensor, points2: Tensor, iterations: int | None = None, decay: float = 1.0
-    ) -> list[Tensor]:
-        """Returns flows f32 (B,N,3): the global match's, then iterations - 1 corrected ones.
-
-        decay: factor of the correction from one iteration to the next (the release is said to test with 0.5).
-        """
+    def forward(self, points1: Tensor, points2: Tensor) -> list[Tensor]:
+        """Returns flows f32 (B,N,3): the global match's, then those of the further iterations, each a corrected one."""
         first, second = self._encode(points1), self._encode(points2)
         coarse = self._global_match(first[-1], second[-1])
         near, other = first[1], second[1]
@@ -119,12 +114,12 @@ class FlowStep3D(nn.Module):
         flows = [three_nn_interpolate(points1, near.points, flow)]
         _, idx = knn(near.points, near.points, self.config.neighbors)
         hidden = torch.tanh(self.start(near.features))
-        for i in range((iterations or self.config.iterations) - 1):
+        for _ in range(self.config.iterations - 1):
             flow = flow.detach()  # each iteration learns to correct what it is given
             compared = self._compare(near, flow, other)
             given = torch.cat([self.move(torch.cat([compared, flow], -1)), near.features], -1)
             hidden = self.unit(hidden, given, near.points, idx)
-            flow = flow + decay**i * self._correction(hidden, near.points, idx)
+            flow = flow + self._correction(hidden, near.points, idx)
             flows.append(three_nn_interpolate(points1, near.points, flow))
         return flows
 

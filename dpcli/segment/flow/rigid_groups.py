@@ -55,7 +55,7 @@ def rigid_groups(
         own = torch.where(open_[:, None], own, torch.inf)
         cost = torch.minimum(cost, own)
         chosen.append(own)
-    return _labels(points, torch.stack(chosen, 1), bound) if chosen else torch.zeros_like(cost, dtype=torch.int64)
+    return _labels(points, torch.stack(chosen, 1), bound) if chosen else torch.full_like(cost, -1, dtype=torch.int64)
 
 
 def _hypotheses(points: Tensor, moved: Tensor, seeds: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
@@ -97,7 +97,7 @@ def _labels(points: Tensor, residual: Tensor, bound: Tensor) -> Tensor:
     Points of smaller bodies than _SMALLEST, and unexplained ones, are -1.
     """
     _, index = knn(points, points, min(8, points.shape[1]))
-    capped = residual.clamp(max=2 * float(bound.max())).transpose(1, 2)  # [B, N, M]
+    capped = torch.minimum(residual, 2 * bound[..., None]).transpose(1, 2)  # [B, N, M]
     smooth = gather_points(capped, index).mean(2)
     value, label = smooth.min(-1)
     label = torch.where(value < 2 * bound, label, -1)

@@ -24,6 +24,7 @@ from dpcli.segment.sequence_splits import hold_out_sequences
 from dpcli.store import CloudsReader
 
 _JUDGED = 64  # held-out pairs
+_SAVED = ("step", "best", "sums", "spent")  # of a trainer, beside the network and the optimizer
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
 
 
@@ -158,17 +159,14 @@ class FlowTrainer:
     def _save(self) -> None:
         self.folder.save_state(
             {
-                "step": self.step,
-                "best": self.best,
-                "sums": self.sums,
-                "spent": self.spent,
+                **{key: getattr(self, key) for key in _SAVED},
                 "model": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
             }
         )
 
     def _restore(self, state: dict) -> None:
-        for key in ("step", "best", "sums", "spent"):
+        for key in _SAVED:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])

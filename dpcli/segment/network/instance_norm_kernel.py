@@ -45,12 +45,8 @@ def norm_kernel(features, rows, channels, slope, first, last):
     channels must be a multiple of 16. Sums of 64 rows are float32, sums of those float64.
     """
     width, zero, step, leak = np.uintp(WIDTH), np.uintp(0), np.uintp(channels), lanes(np.float32(slope))
-    shift, scale, part, found = (
-        np.empty(PAIR, np.float32),
-        np.empty(PAIR, np.float32),
-        np.empty(PAIR, np.float32),
-        np.empty(PAIR),
-    )
+    shift, scale, part = np.empty(PAIR, np.float32), np.empty(PAIR, np.float32), np.empty(PAIR, np.float32)
+    found = np.empty(PAIR)
     groups = channels // PAIR
     for item in range(first * groups, last * groups):
         start = np.uintp(item // groups * rows * channels + item % groups * PAIR)
@@ -61,12 +57,8 @@ def norm_kernel(features, rows, channels, slope, first, last):
         _means(features, start, step, rows, shift, True, part, found)
         for c in range(PAIR):
             scale[c] = 1 / math.sqrt(found[c] + 1e-5)
-        low_shift, high_shift, low_scale, high_scale = (
-            load(shift, zero),
-            load(shift, width),
-            load(scale, zero),
-            load(scale, width),
-        )
+        low_shift, high_shift = load(shift, zero), load(shift, width)
+        low_scale, high_scale = load(scale, zero), load(scale, width)
         for row in range(np.uintp(rows)):
             at = start + row * step
             a, b = (load(features, at) - low_shift) * low_scale, (load(features, at + width) - high_shift) * high_scale

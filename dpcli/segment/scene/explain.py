@@ -12,7 +12,7 @@ from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
 from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
-from dpcli.segment.scene.tracking import MovingObject, extended
+from dpcli.segment.scene.tracking import MovingObject, motion_from_to
 from dpcli.segment.scene.world import Frame, World
 
 _SURE = 50.0  # points explained better that make an object two thirds surer
@@ -47,10 +47,7 @@ class SceneExplanation:
 
         An object that was not met in one of the two frames keeps its motion between the nearest frames it was met in.
         """
-        own = np.eye(4)
-        if part > 0:
-            known = self.objects[part - 1]
-            own = extended(known, target) @ np.linalg.inv(extended(known, source))
+        own = motion_from_to(self.objects[part - 1], source, target) if part > 0 else np.eye(4)
         return np.linalg.inv(self.pose[target]) @ own @ self.pose[source]
 
 
@@ -62,27 +59,30 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
     """
     filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
-    poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
-    dropped, ground_seen, sensor_known, way_shown = 0, True, True, True
-    if len(filled) > 1:
-        shown = [frames[t] for t in filled]
-        largest = max(shown, key=len)
-        eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
-        sensor_known = eye is not None and all(_may_be_sensor(shown[t], eye) for t in (0, -1))
-        world, own, turn, apart, ground_seen = _build_world(shown, eye, settings)
-        widest = max(world.frames, key=lambda frame: len(frame.points))
-        way_shown = shows_the_way(widest.points, widest.height < settings.ground)
-        every = find_moving_objects(world, settings)
-        found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
-        for number, one in enumerate(found, 1):
-            for t, points in one.points.items():
-                labels[filled[t]][points] = number
-        before = np.maximum(np.searchsorted(filled, np.arange(len(frames)), side="right") - 1, 0)
-        poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
-        objects = [_in_input_axes(one, filled, turn) for one in found]
-    confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
-    far = [filled[t] for t in apart]
-    return SceneExplanation(labels, poses, objects, confidence, far, dropped, ground_seen, sensor_known, way_shown)
+    if len(filled) < 2:
+        return SceneExplanation(labels, np.tile(np.eye(4), (len(frames), 1, 1)), [], [], [], 0)
+    shown = [frames[t] for t in filled]
+    largest = max(shown, key=len)
+    eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
+    world, own, turn, apart, ground_seen = _build_world(shown, eye, settings)
+    every = find_moving_objects(world, settings)
+    found = every[: settings.most_objects]
+    for number, one in enumerate(found, 1):
+        for t, points in one.points.items():
+            labels[filled[t]][points] = number
+    before = np.maximum(np.searchsorted(filled, np.arange(len(frames)), side="right") - 1, 0)
+    widest = max(world.frames, key=lambda frame: len(frame.points))
+    return SceneExplanation(
+        labels,
+        pose=(turn.T @ own @ turn)[before],  # frames that show nothing are where the one before was
+        objects=[_in_input_axes(one, filled, turn) for one in found],
+        confidence=[1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found],
+        apart=[filled[t] for t in apart],
+        dropped=len(every) - len(found),
+        ground_seen=ground_seen,
+        sensor_known=eye is not None and all(_may_be_sensor(shown[t], eye) for t in (0, -1)),
+        way_shown=shows_the_way(widest.points, widest.height < settings.ground),
+    )
 
 
 def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:

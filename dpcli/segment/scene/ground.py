@@ -36,7 +36,8 @@ def find_up(points: np.ndarray, sensor: np.ndarray | None) -> tuple[np.ndarray, 
     thin = np.asarray(rest.points)
     extent = np.ptp(np.percentile(thin, (2, 98), axis=0), axis=0)
     best, up = 0.0, np.eye(3)[extent.argmin()] if len(points) > 2 else np.eye(3)[2]
-    sight, axis = _viewing_direction(thin, sensor), _axis_of_beams(points, sensor)
+    sight = np.zeros(3) if sensor is None else _directions(thin, sensor).mean(0)  # short when it looks all around
+    axis = _axis_of_beams(points, sensor)
     if axis is not None:
         nearest = np.eye(3)[np.abs(axis).argmax()]
         up = nearest if nearest @ axis >= _LEVEL else axis
@@ -53,12 +54,10 @@ def find_up(points: np.ndarray, sensor: np.ndarray | None) -> tuple[np.ndarray, 
     return up, best > 0
 
 
-def _viewing_direction(points: np.ndarray, sensor: np.ndarray | None) -> np.ndarray:
-    """Returns the mean f64 (3) of the unit vectors from the sensor to the points; short when it looks all around."""
-    if sensor is None:
-        return np.zeros(3)
+def _directions(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """Returns the unit vectors f64 (N,3) from the sensor (3) to points (N,3)."""
     way = points - sensor
-    return (way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)).mean(0)
+    return way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
 
 
 def _axis_of_beams(points: np.ndarray, sensor: np.ndarray | None) -> np.ndarray | None:
@@ -67,10 +66,11 @@ def _axis_of_beams(points: np.ndarray, sensor: np.ndarray | None) -> np.ndarray 
     None where the sensor is unknown, looks ahead, or looks into all directions alike. Beams rise and fall less than they
     turn, however near a wall is.
     """
-    if sensor is None or len(points) < 3 or np.linalg.norm(_viewing_direction(points, sensor)) > _AHEAD:
+    if sensor is None or len(points) < 3:
         return None
-    way = points - sensor
-    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    way = _directions(points, sensor)
+    if np.linalg.norm(way.mean(0)) > _AHEAD:
+        return None
     spread, axes = np.linalg.eigh(way.T @ way)
     axis = axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0])
     return axis if spread[0] < _ALL_AROUND * spread[1] else None

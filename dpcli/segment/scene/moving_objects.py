@@ -121,15 +121,16 @@ def _judge(one: MovingObject, world: World, settings: SceneSettings) -> bool:
 
     Points that stand are taken out before. Things on the sensor's own vehicle, which go where it goes, are no objects.
     """
+    if len(one.points) < 2:
+        return False
     saved, still, through, count, upright = 0.0, 0.0, 0.0, 0, False
-    for t in [t for t in one.points if len(one.points) > 1]:
-        frame = world.frames[t]
+    for t in one.points:
         costs, moving, free = _costs(one, t, world)
         kept = costs - moving > -_WORSE
         one.points[t] = one.points[t][kept]
         saved, still = saved + (costs - moving)[kept].sum(), still + costs[kept].sum()
         through, count = through + free[kept].sum(), count + int(kept.sum())
-        upright = upright or _stands_upright(one.points[t], frame)
+        upright = upright or _stands_upright(one.points[t], world.frames[t])
     one.saved = float(saved)
     share = _SHARE[0] if one.demand == 1 else _SHARE[1]
     enough = saved >= max(one.demand * settings.evidence, one.demand * _GAIN * count, share * still)

@@ -9,7 +9,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
-from dpcli.segment.rigid_motions import move
+from dpcli.segment.rigid_motions import move, move_each
 from dpcli.segment.scene.explain import SceneExplanation, explain_scene
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.segmenters import Segmenter
@@ -66,7 +66,7 @@ class SceneSegmenter(Segmenter):
         for own, (i, j) in zip(motions, pairs):
             for part in range(len(found.objects) + 1):
                 own[part] = found.motion(part, place[i], place[j])
-            target = _moved_by_parts(clouds[i], found.labels[place[i]], own)
+            target = move_each(own[found.labels[place[i]]], clouds[i])
             flows.append(np.float32((target - clouds[i]) / unit))
         motions = np.linalg.inv(to_meters) @ motions @ to_meters
         sure = np.eye(self.slots, dtype=np.float32)
@@ -145,11 +145,3 @@ def _tell_size(name: str, clouds: list[np.ndarray], length_unit: str) -> float:
             f" convert the data again with the right --unit (the file's is {length_unit or 'unknown'})"
         )
     return radius
-
-
-def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """Returns points f64 (N,3) that follow the motions (K,4,4) of their labels (N)."""
-    target = np.empty_like(points)
-    for part in np.unique(label):
-        target[label == part] = move(motions[part], points[label == part])
-    return target

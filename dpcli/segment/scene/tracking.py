@@ -46,7 +46,12 @@ class MovingObject:
 
     def between(self, source: int, target: int) -> np.ndarray:
         """Returns its motion f64 (4,4) from a frame to another one, in the world."""
-        return extended(self.motion, target) @ np.linalg.inv(extended(self.motion, source))
+        return motion_from_to(self.motion, source, target)
+
+
+def motion_from_to(known: dict[int, np.ndarray], source: int, target: int) -> np.ndarray:
+    """Returns the motion f64 (4,4) from a frame to another one, from known motions to frames, `extended` where needed."""
+    return extended(known, target) @ np.linalg.inv(extended(known, source))
 
 
 def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:

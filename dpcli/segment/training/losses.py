@@ -9,16 +9,23 @@ from dpcli.ops import apply_motions
 from dpcli.segment.network.slot_matching import hungarian_assignment, one_hot, permute_slots, soft_iou
 
 
-def dynamic_loss(points: Tensor, flow: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """Returns the rigidity loss as released: mean_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar.
+def dynamic_loss(
+    points: Tensor,  # [B, N, 3]
+    flow: Tensor,  # [B, N, 3]
+    mask: Tensor,  # [B, N, S]
+    rotation: Tensor,  # [B, S, 3, 3]
+    translation: Tensor,  # [B, S, 3]
+    trust: Tensor | None = None,  # [B, N]
+) -> Tensor:
+    """Returns the rigidity loss as released: mean_i c_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar.
 
-    points (B,N,3), flow (B,N,3), mask (B,N,S), rotation (B,S,3,3), translation (B,S,3). OGC's "dynamic rigid
-    consistency" (Song and Yang 2022). The moved points are detached: the gradient reaches the mask only. At a residual
-    of exactly zero it is zero.
+    OGC's "dynamic rigid consistency" (Song and Yang 2022). trust: the weights c, of which None counts as 1. The moved
+    points are detached: the gradient reaches the mask only. At a residual of exactly zero it is zero.
     """
     moved = apply_motions(points, rotation, translation).detach()
     blended = torch.einsum("bns,bsnd->bnd", mask, moved)
-    return _length(blended - (points + flow).detach()).mean()
+    gap = _length(blended - (points + flow).detach())
+    return (gap if trust is None else trust * gap).mean()
 
 
 def rigid_loss(
@@ -93,18 +100,12 @@ def invariance_loss(mask1: Tensor, mask2: Tensor) -> Tensor:
     return forth + back
 
 
-def supervised_loss(
-    mask: Tensor,  # [B, N, S]
-    labels: Tensor,  # [B, N]
-    *,
-    bce_weight: float = 2.0,
-    dice_weight: float = 0.0,
-) -> Tensor:
-    """Returns the binary cross-entropy of each slot with the part it is matched to, plus Dice; a scalar.
+def supervised_loss(mask: Tensor, labels: Tensor) -> Tensor:
+    """Returns twice the mean binary cross-entropy of each slot with the part it is matched to, as released; a scalar.
 
-    The Hungarian match is made on that cost. labels: part ids i64 from 0, -1 = unknown: such points count nothing, but
-    stay in the denominator, as in the release. Parts beyond the number of slots find no slot; slots beyond the parts
-    should stay empty. Dice is 1 - (2 sum m g + 1) / (sum m + sum g + 1), the mean over slots.
+    The Hungarian match is made on that cost. mask (B,N,S); labels (B,N): part ids i64 from 0, -1 = unknown: such points
+    count nothing, but stay in the denominator, as in the release. Parts beyond the number of slots find no slot; slots
+    beyond the parts should stay empty.
     """
     known = (labels >= 0).to(mask.dtype)[..., None]
     parts = max(int(labels.max()) + 1, mask.shape[2])
@@ -112,12 +113,7 @@ def supervised_loss(
     inside, outside = _log(mask) * known, _log(1 - mask) * known
     gain = (inside.mT @ truth + outside.mT @ (1 - truth)) / mask.shape[1]  # [B, S, parts]
     order = hungarian_assignment(gain)
-    bce = -gain.gather(2, order[..., None]).mean()
-    if not dice_weight:
-        return bce_weight * bce
-    matched = permute_slots(truth, order)
-    both, total = (mask * matched).sum(1), (mask * known + matched).sum(1)
-    return bce_weight * bce + dice_weight * (1 - (2 * both + 1) / (total + 1)).mean()
+    return -2 * gain.gather(2, order[..., None]).mean()
 
 
 def _log(share: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpcli.ops import apply_motions, weighted_kabsch
+from dpcli.ops import weighted_kabsch
 from dpcli.ops.rotations import normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.flow.rigid_groups import rigid_groups
@@ -29,11 +29,6 @@ class Batch:
     points: Tensor
     flow: Tensor
     part: Tensor
-
-    @property
-    def other(self) -> Tensor:
-        """Returns the points of each frame's counterpart."""
-        return swap(self.points)
 
 
 def swap(values: Tensor) -> Tensor:
@@ -103,17 +98,8 @@ def _rigidity(
     """Returns the rigidity loss in the form that the objective names, weighted by the consensus where there is one."""
     if objective.form == "per-part":  # the mean over slots of eq. 4.8, times their number: of the blended form's size
         return mask.shape[-1] * rigid_loss(batch.points, batch.flow, mask, rotation, translation, beta)
-    if beta is None:
-        return dynamic_loss(batch.points, batch.flow, mask, rotation, translation)
-    trust = (beta * mask.detach()).sum(-1)  # one weight per point: the blended form has one residual per point
-    return _weighted_dynamic(batch, mask, rotation, translation, trust)
-
-
-def _weighted_dynamic(batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, trust: Tensor) -> Tensor:
-    """Returns `dynamic_loss` with one weight per point, trust (2B,N)."""
-    moved = apply_motions(batch.points, rotation, translation).detach()
-    gap = torch.einsum("bns,bsnd->bnd", mask, moved) - (batch.points + batch.flow)
-    return (trust * (gap.square().sum(-1) + 1e-12).sqrt()).mean()
+    trust = None if beta is None else (beta * mask.detach()).sum(-1)  # the blended form has one residual per point
+    return dynamic_loss(batch.points, batch.flow, mask, rotation, translation, trust)
 
 
 def _match(batch: Batch, mask: Tensor) -> Tensor:
@@ -149,13 +135,10 @@ def _consensus(
     motions: the head's, from frames 1 to 2; frames 2 to 1 have their inverse, in frames 2's slots.
     """
     rotation, translation = motions
-    back = order.argsort(1)
-    inverse = rotation.mT
+    back, inverse = order.argsort(1), rotation.mT
     inverse_shift = -(inverse @ translation[..., None]).squeeze(-1)
-    rotation = torch.cat([rotation, _permute(inverse, back)])
-    translation = torch.cat([translation, _permute(inverse_shift, back)])
-    options = {"tau": objective.tau, "form": objective.consensus}
-    return consensus_weights(batch.points, batch.flow, rotation, translation, mask=mask, **options)
+    both = torch.cat([rotation, _permute(inverse, back)]), torch.cat([translation, _permute(inverse_shift, back)])
+    return consensus_weights(batch.points, batch.flow, *both, tau=objective.tau, form=objective.consensus, mask=mask)
 
 
 def _permute(values: Tensor, order: Tensor) -> Tensor:
@@ -168,7 +151,7 @@ def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Obje
     """Returns the flow of eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
-    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, order=both)
+    newest, _, _ = object_aware_icp(batch.points, swap(batch.points), mask, swap(mask), batch.flow, order=both)
     return objective.flow_decay * batch.flow + (1 - objective.flow_decay) * newest
 
 

@@ -30,16 +30,15 @@ from dpcli.segment.training.pair_loss import Batch, pair_loss, turn_randomly
 from dpcli.segment.training.settings import TrainSettings
 
 _SAVE_EVERY = 100  # steps between checkpoints: their flows are what memory holds
-
-
+_SAVED = ("epoch", "step", "best", "sums", "spent")  # of a trainer, beside the network, the optimizer and the flows
 Estimate = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 class Trainer:
     """Trains one network on the device it is on.
 
-    estimate: gives the first flow, forth and back, of two frames (N,3); None for supervised training. notes: what the
-    weights file says of the training.
+    estimate: gives the first flow, forth and back, of two frames (N,3), of which supervised training has no need. notes:
+    what the weights file says of the training.
     """
 
     def __init__(
@@ -49,7 +48,7 @@ class Trainer:
         settings: TrainSettings,
         training: PairSource,
         validation: PairSource | None,
-        estimate: Estimate | None,
+        estimate: Estimate,
         notes: dict,
         stop: StopRequest,
         seed: int,
@@ -278,11 +277,7 @@ class Trainer:
     def _save(self) -> None:
         self.folder.save_state(
             {
-                "epoch": self.epoch,
-                "step": self.step,
-                "best": self.best,
-                "sums": self.sums,
-                "spent": self.spent,
+                **{key: getattr(self, key) for key in _SAVED},
                 "model": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "flows": self.flows.pending(),
@@ -291,7 +286,7 @@ class Trainer:
         self.flows.flush()
 
     def _restore(self, state: dict) -> None:
-        for key in ("epoch", "step", "best", "sums", "spent"):
+        for key in _SAVED:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -14,6 +14,7 @@ from dpcli.errors import UsageError
 from dpcli.segment.flow import motion_proposals
 from dpcli.segment.flow.estimators import estimate_body_flow, estimate_flow, find_bodies_at_any_scale
 from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
+from dpcli.segment.flow.rigid_groups import rigid_groups
 from dpcli.segment.flow.surface_icp import Surface, columns
 
 
@@ -215,3 +216,16 @@ def test_every_step_of_the_search_lowers_the_energy(pairs: list[tuple]) -> None:
     assert len(steps) >= 3
     assert all(after.energy < before.energy for before, after in pairwise(steps))
     assert search._tighten_motions(steps[-1]).energy <= steps[-1].energy
+
+
+def test_bodies_of_a_flow_are_the_same_alone_and_beside_a_noisier_one() -> None:
+    rng = torch.Generator().manual_seed(0)
+    points = torch.rand(2, 200, 3, generator=rng)
+    rises = (points[..., :1] > 0.5) * torch.tensor([0.0, 0.0, 0.1])
+    outliers = (torch.rand(2, 200, 1, generator=rng) < 0.05) * 0.1 * torch.randn(2, 200, 3, generator=rng)
+    flow = rises + outliers
+    for noise in (0.05, 0.5):  # in the last nothing moves as one
+        flow[1] += noise * torch.randn(200, 3, generator=rng)
+        alone = [rigid_groups(points[b : b + 1], flow[b : b + 1]) for b in range(2)]
+        assert torch.equal(rigid_groups(points, flow), torch.cat(alone))
+    assert alone[0].max() > 0 and (alone[1] == -1).all()

@@ -83,13 +83,6 @@ def test_shifting_both_frames_changes_nothing() -> None:
     assert (model(first, second + offset)[-1] - flow).abs().max() > 0.1  # the checker is no constant
 
 
-def test_decay_shrinks_later_corrections() -> None:
-    full, less = (network()(*clouds(2), iterations=4, decay=d) for d in (1.0, 0.0))
-    torch.testing.assert_close(full[1], less[1])
-    torch.testing.assert_close(less[1], less[3])
-    assert (full[3] - full[1]).abs().max() > 1e-3
-
-
 def test_chamfer_by_brute_force_and_its_gradient() -> None:
     first, second = (c.double()[:, :9] for c in clouds(3))
     distance = torch.cdist(first, second)

@@ -162,7 +162,7 @@ def test_supervised_loss_at_the_ends() -> None:
     """A perfect hard mask costs nothing, a certain mistake costs a finite sum, more parts than slots find no slot."""
     labels = torch.tensor([[0, 0, 1, 1]])
     perfect = torch.tensor([[[0.0, 1], [0, 1], [1, 0], [1, 0]]], requires_grad=True)
-    loss = supervised_loss(perfect, labels, dice_weight=1.0)
+    loss = supervised_loss(perfect, labels)
     loss.backward()
     assert float(loss.detach()) == pytest.approx(0, abs=1e-6) and perfect.grad.isfinite().all()
     assert 0 < float(supervised_loss(perfect.detach(), torch.tensor([[0, 1, 0, 1]]))) < 1e3
@@ -174,7 +174,7 @@ def test_supervised_gradient() -> None:
     _, _, mask, *_ = scene(6, 10)
     labels = torch.tensor(np.random.default_rng(6).integers(-1, 3, (2, 10)))
     mask = mask.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda m: supervised_loss(m, labels, dice_weight=0.3), (mask,))
+    assert torch.autograd.gradcheck(lambda m: supervised_loss(m, labels), (mask,))
 
 
 def test_hungarian_assignment_maximizes() -> None:
@@ -254,8 +254,6 @@ def test_golden_losses(golden: dict[str, torch.Tensor]) -> None:
     torch.testing.assert_close(invariance_loss(mask1, mask2), golden["invariance"], rtol=0, atol=1e-5)
     labels = torch.where(golden["sup_valid"] > 0, golden["sup_gt"].argmax(-1), -1)
     torch.testing.assert_close(supervised_loss(mask1, labels), golden["sup_loss"], rtol=0, atol=1e-6)
-    both = supervised_loss(mask1, labels, dice_weight=0.1)
-    torch.testing.assert_close(both, golden["sup_loss_dice01"], rtol=0, atol=1e-6)
 
 
 def test_golden_matching_and_icp(golden: dict[str, torch.Tensor]) -> None:

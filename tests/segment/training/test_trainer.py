@@ -1,4 +1,4 @@
-"""The training loop's own judgment of held-out pairs."""
+"""The training loop's own judgment of held-out pairs, and the flows that it continues with."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from dpcli.runtime.run_folder import RunFolder
+from dpcli.segment.training.flow_store import FlowStore
 from dpcli.segment.training.pair_loss import Batch
-from dpcli.segment.training.settings import Objective
+from dpcli.segment.training.settings import Objective, RunSettings
 from dpcli.segment.training.trainer import Trainer
 
 
@@ -27,3 +29,28 @@ def test_the_rand_index_is_that_of_the_points_whose_part_is_known():
     assert Trainer.validate(trainer)["validation_rand_index"] == pytest.approx(agree)
     batch.part = torch.full_like(part, -1)
     assert Trainer.validate(trainer)["validation_rand_index"] is None
+
+
+def test_a_kill_between_the_state_and_the_flows_loses_no_flow(tmp_path, monkeypatch):
+    with RunFolder(tmp_path, {}, columns=("epoch",)) as folder:
+        nothing = SimpleNamespace(state_dict=dict)
+        trainer = SimpleNamespace(
+            folder=folder,
+            model=nothing,
+            optimizer=nothing,
+            training=SimpleNamespace(pairs=[0, 1], points=5),
+            settings=SimpleNamespace(run=RunSettings()),
+            **dict.fromkeys(("epoch", "step", "best", "sums", "spent"), 0),
+        )
+        Trainer._open_flows(trainer, None)
+        trainer.flows.put_first(0, torch.ones(2, 5, 3), True)
+        trainer.flows.put(0, torch.full((2, 5, 3), 2.0))
+
+        def die(self):
+            raise InterruptedError
+
+        with monkeypatch.context() as patch, pytest.raises(InterruptedError):
+            patch.setattr(FlowStore, "flush", die)
+            Trainer._save(trainer)
+        Trainer._open_flows(trainer, folder.load_state())
+    assert float(trainer.flows.get(0).mean()) == 2 and trainer.flows.shows_bodies(0) and trainer.flows.get(1) is None
