@@ -16,7 +16,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.likeness import like, tell_unlike, tell_values
 from dpcli.classify.data.videos import SILENT
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
 from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
@@ -78,8 +78,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     new_listener: makes the one who takes the predictions. Returns the number of frames.
     Raises what ended the stream early.
     """
-    weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    model, info = load_model(task.model, task.backbone)
     device = choose_device(task.device)
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
     confidence = choose_confidence(info.notes, options.reject_below, task.model)
@@ -95,7 +94,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
         if not predictor.clips:
             raise problem or _nothing_seen(task.source, watch.empty)
         if target is not None:
-            target.provenance.append(provenance.record(_record(weights, options, info, predictor), task.seed))
+            target.provenance.append(provenance.record(_record(task, options, info, predictor), task.seed))
             fused, *single = predictor.mean
             target.write(Path(task.source).stem, fused, streams=dict(zip(predictor.streams, single)))
     if task.output:
@@ -116,15 +115,14 @@ def _writer(task: ModelTask, info: ModelInfo, predictor: StreamPredictor) -> Sco
     )
 
 
-def _record(weights: Path, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
+def _record(task: ModelTask, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
     """Returns what shapes the scores, for the file's provenance."""
     return {
         "stream": True,
         "hop": options.hop,
         "window": predictor.window.size,
         "frames": predictor.window.count,
-        "model": info.notes,
-        "weights": provenance.file_digest(weights),
+        **task.model_record(info),
         "fusion": info.config.fusion,
     }
 

@@ -64,11 +64,10 @@ def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, .
 
 
 class OneVideo:
-    """Holds one sequence of a `clouds` file, with its number there, as a reader that knows no other."""
+    """Holds one sequence of a `clouds` file as a reader that knows no other."""
 
-    def __init__(self, number: int, sequence: CloudSequence) -> None:
-        self.path, self.names = sequence.name, {number: sequence.name}
-        self.frame_counts = {number: sequence.num_frames}
+    def __init__(self, sequence: CloudSequence) -> None:
+        self.path, self.names, self.frame_counts = sequence.name, [sequence.name], [sequence.num_frames]
         self.fields = tuple(sequence.extra)
         self._sequence = sequence
 
@@ -127,7 +126,7 @@ class ClipSource:
         """Returns the clips of one video: every start, or `count`."""
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "slots":
-            return [Clip(sequence, shown) for shown in _looks(length, count or _LOOKS)]
+            return [Clip(sequence, shown) for shown in _looks(length, count or LOOKS)]
         if self.timing == "uniform":
             return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
@@ -218,7 +217,7 @@ class ClipSource:
         return made
 
 
-_LOOKS = 4  # at a video in slots
+LOOKS = 4  # at a video in slots, at most
 _END = 0.08  # of its frames that a look leaves out at an end
 
 

@@ -12,7 +12,7 @@ import torch
 
 from dpcli.classify.data.clips import Clip, ClipSource, clip_frames, uniform_frames
 from dpcli.classify.data.likeness import NOTE
-from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.video_scores import clip_scores
 from dpcli.counted import counted
@@ -122,7 +122,7 @@ class StreamPredictor:
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
         self.window = Window(window_size(info, window), info.config.columns)
         self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
-        self.streams = tuple(info.notes.get("streams", STREAMS))
+        self.streams = info.streams
         self.clips = 0
         self._sum = np.zeros((1 + len(self.streams), info.config.num_classes))
 

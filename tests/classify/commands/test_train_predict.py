@@ -146,11 +146,11 @@ from dpcli.classify.commands import predict as commands
 from dpcli.cli.app import main
 number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.ScoreVideo.__call__
 scored = []
-def ending(work, numbered):
-    scored.append(numbered[0])
+def ending(work, video):
+    scored.append(video.name)
     if len(scored) == after + 1:
         os.kill(os.getpid(), number)
-    return whole(work, numbered)
+    return whole(work, video)
 commands.ScoreVideo.__call__ = ending
 main()
 """
@@ -172,13 +172,13 @@ def ending_early(number: int, after: int, dpc_here, words: list) -> subprocess.C
         return subprocess.run([str(word) for word in command], capture_output=True, env=environment)
     score, scored = predict.ScoreVideo.__call__, []
 
-    def ending(work, numbered):
-        scored.append(numbered[0])
+    def ending(work, video):
+        scored.append(video.name)
         if len(scored) == after + 1 and not number:
             raise MemoryError
         if len(scored) == after + 1:
             os.kill(os.getpid(), number)
-        return score(work, numbered)
+        return score(work, video)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(predict.ScoreVideo, "__call__", ending)
@@ -197,7 +197,7 @@ def test_a_stopped_and_a_killed_prediction_go_on(
         assert b"4 of 12 videos are kept; run the same command again to continue" in first.stderr
     score, scored = predict.ScoreVideo.__call__, []
     monkeypatch.setattr(
-        predict.ScoreVideo, "__call__", lambda work, numbered: scored.append(numbered[0]) or score(work, numbered)
+        predict.ScoreVideo, "__call__", lambda work, video: scored.append(video.name) or score(work, video)
     )
     second = dpc_here(*words, "--batch=2")
     assert second.returncode == 0 and len(scored) == 12 - kept
@@ -559,12 +559,12 @@ def test_every_start_is_scored(data, run_folder, dpc_here, tmp_path):
 
     from dpcli.classify.data.clips import ClipSource
     from dpcli.classify.network.model_file import load_model
-    from dpcli.classify.video_scores import batches, predict_videos
+    from dpcli.classify.video_scores import batches, score_video
 
     model, info = load_model(str(run_folder))
     reader = CloudsReader(data)
     source = ClipSource(reader, [2], info.config)
-    video = next(predict_videos(model, source, None, 8, torch.device("cpu")))
+    video = score_video(model, source, 2, None, 8, torch.device("cpu"))
     assert video.clips == 3
     with torch.inference_mode():
         rows = [model(points)[0].softmax(-1) for _, points in batches(source, source.clips(None), 1)]
