@@ -2,8 +2,7 @@
 
 Thesis section 3.4.2.3 and A.1.3. A run can be stopped at any step and continued to the same result: every clip's
 randomness comes from (seed, epoch, position), what a step drops from (seed, stage, epoch, step), and the state holds weights,
-optimizer and the step. Several processes
-(torchrun) share each batch and take the steps that one process would take.
+optimizer and the step. Several processes (torchrun) share each batch and take the steps that one process would take.
 """
 
 from __future__ import annotations
