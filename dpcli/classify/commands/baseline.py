@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,9 +56,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
     refuse_repeats([data, *([output] if output else [])])
     if output not in (None, "-"):
         refuse_existing(str(output), force)
-    with ExitStack() as stack:
-        path = stack.enter_context(input_file(data))
-        reader = stack.enter_context(CloudsReader(path))
+    with input_file(data) as path, CloudsReader(path) as reader:
         known = np.flatnonzero(reader.labels >= 0)
         if not len(known):
             raise DataError(f"{path}: no video has a label; prepare them with --labels TABLE or --label-from-folder")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,6 @@ from dpcli.classify.confidence import choose_confidence
 from dpcli.classify.data.clips import check_columns
 from dpcli.classify.data.likeness import tell_unlike_file
 from dpcli.classify.data.videos import check_classes, report_empty, report_gaps, select_videos
-from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
 from dpcli.classify.stream.sliding_window import StreamPredictor, window_size
@@ -49,7 +48,7 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
     suffix = _suffix(task)
     model, info = load_model(task.model, task.backbone)
     how = _cutting(info, options, task.model)
-    new_predictor = _predictors(model, info, how, task)
+    device = choose_device(task.device)
     with input_file(task.data) as path:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
@@ -61,7 +60,8 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
         recordings = {}
         with Progress("classify predict --segments", int(reader.frame_counts[chosen].sum()), "frame") as bar:
             for i in chosen:
-                scored = _with_true_times(score_windows(new_predictor(), reader, i, bar), reader.names[i])
+                predictor = StreamPredictor(model, info, window=how.window, hop=how.hop, seed=task.seed, device=device)
+                scored = _with_true_times(score_windows(predictor, reader, i, bar), reader.names[i])
                 recordings[reader.names[i]] = cut(scored, info.class_names, how)
         entry = provenance.record(_record(task, info, how), task.seed, {"clouds": path})
         found = Segments(recordings, info.class_names, [*reader.provenance, entry])
@@ -108,15 +108,6 @@ def _cutting(info: ModelInfo, options: SegmentOptions, model: str) -> Cutting:
     if shortest < 1:
         raise UsageError(f"--shortest {shortest}: expected at least 1 frame")
     return Cutting(window, hop, shortest, choose_confidence(info.notes, options.reject_below, model))
-
-
-def _predictors(model: Kinet, info: ModelInfo, how: Cutting, task: ModelTask) -> Callable[[], StreamPredictor]:
-    device, window = choose_device(task.device), how.window if info.timing != "clips" else None
-
-    def new() -> StreamPredictor:
-        return StreamPredictor(model, info, window=window, hop=how.hop, seed=task.seed, device=device)
-
-    return new
 
 
 def _with_true_times(found: WindowScores, name: str) -> WindowScores:

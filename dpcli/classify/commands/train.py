@@ -273,7 +273,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
         log.warn(f"{path}: {others}")
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
-    tell_mixed_rates(reader, training, run.timing)
+    tell_mixed_rates(reader, training, looks, run.timing)
     if settings.network.normalize not in ANY_UNIT:
         tell_mixed_sizes(reader, sorted({*training, *validation}))
     left_out: dict[str, str] = {}

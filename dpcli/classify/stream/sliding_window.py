@@ -41,6 +41,11 @@ class Window:
         return len(self._frames)
 
     @property
+    def frames(self) -> list[np.ndarray]:
+        """Returns the frames that are held, the oldest first."""
+        return list(self._frames)
+
+    @property
     def frame_counts(self) -> list[int]:
         """Returns the number of frames of each video, as a reader does: of this one video, those seen so far."""
         return [self.count]

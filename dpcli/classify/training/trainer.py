@@ -29,6 +29,15 @@ from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import torch_seed
 from dpcli.runtime.signals import StopRequest
 
+_KEPT = (
+    "stage",
+    "epoch",
+    "step",
+    "best",
+    "sums",
+    "spent",
+)  # what a state holds of a trainer beside weights and optimizer
+
 
 class Trainer:
     """Runs both stages of one model. `training` and `validation` are clip sources (validation may be None)."""
@@ -227,12 +236,7 @@ class Trainer:
         if self.processes.first:
             self.folder.save_state(
                 {
-                    "stage": self.stage,
-                    "epoch": self.epoch,
-                    "step": self.step,
-                    "best": self.best,
-                    "sums": self.sums,
-                    "spent": self.spent,
+                    **{key: getattr(self, key) for key in _KEPT},
                     "model": self.model.state_dict(),
                     "optimizer": self.optimize.optimizer.state_dict() if self.optimize is not None else None,
                 }
@@ -241,7 +245,7 @@ class Trainer:
             self.processes.wait()
 
     def _restore(self, state: dict) -> None:
-        for key in ("stage", "epoch", "step", "best", "sums", "spent"):
+        for key in _KEPT:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         if self.stage < 2 and state["optimizer"] is not None:
