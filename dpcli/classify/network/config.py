@@ -12,6 +12,19 @@ from dpcli.runtime.settings.stored import from_json
 
 CROSS = "cross"  # the rule of validation by which every video is judged by members that never saw it
 
+# what the published code does: groups of 3 features, a group of raw coordinates, absolute time, weights by projection, a merge
+# across scales, averaged logits
+RELEASE = {
+    "variant": "release",
+    "group_size": 3,
+    "xyz_group": True,
+    "time_input": True,
+    "weighting": "projection",
+    "merge": "cross",
+    "guard": "release",
+    "fusion": "logits",
+    "grouping": "first",
+}
 _MOST_POINTS = 1 << 22  # of a clip: 85 times those of the thesis
 
 
@@ -211,20 +224,8 @@ class KinetConfig:
 
     @classmethod
     def release(cls, **changes: object) -> KinetConfig:
-        """Returns the published code's choices, with changes over them: groups of 3 features, a group of raw coordinates, absolute
-        time, weights by projection, a merge across scales, averaged logits."""
-        choices = {
-            "variant": "release",
-            "group_size": 3,
-            "xyz_group": True,
-            "time_input": True,
-            "weighting": "projection",
-            "merge": "cross",
-            "guard": "release",
-            "fusion": "logits",
-            "grouping": "first",
-        }
-        return cls(**{**choices, **changes})
+        """Returns the published code's choices, `RELEASE`, with changes over them."""
+        return cls(**{**RELEASE, **changes})
 
     def changed(self, **changes: object) -> KinetConfig:
         """Returns a copy with some fields changed. Raises UsageError where they don't fit."""
