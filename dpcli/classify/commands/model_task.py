@@ -46,7 +46,7 @@ class ModelTask:
         """Returns the clips of some videos as the model takes them; messages tell what is odd about these videos."""
         options = {"timing": info.timing, "drop_short": drop_short, "seed": self.seed}
         source = ClipSource(reader, sequences, info.config, **options)
-        report_short(source, info.config.num_frames)
+        report_short(source)
         report_backward(reader, source.sequences)
         report_gaps(reader, source.sequences)
         tell_unlike_file(reader, source.sequences, info, self.model)

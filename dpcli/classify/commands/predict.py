@@ -55,7 +55,7 @@ class ScoreVideo:
     def __call__(self, sequence: CloudSequence) -> VideoScores:
         """Returns the scores of a sequence."""
         model, info = self.model.get()
-        source = ClipSource(OneVideo(sequence), [0], info.config, timing=info.timing, seed=self.seed)
+        source = ClipSource(OneVideo.of(sequence), [0], info.config, timing=info.timing, seed=self.seed)
         return score_video(model, source, 0, self.clips_per_video, self.batch, self.device, self.streams)
 
 

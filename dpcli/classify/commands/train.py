@@ -177,7 +177,7 @@ def _train(
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
     sources = [source for source in (videos.training, videos.validation) if source is not None]
     for source in sources:
-        report_short(source, settings.network.num_frames)
+        report_short(source)
     looked_at = sorted({i for source in sources for i in source.sequences})
     report_backward(videos.training.reader, looked_at)
     report_gaps(videos.training.reader, looked_at)
@@ -350,8 +350,7 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
             " at least two classes are needed"
             + (f" (--validation {rule} holds out all videos of the others: give another)" if others else "")
         )
-    judged = {int(reader.labels[i]) for i in validation} | set(np.unique(reader.labels[reader.labels >= 0]).tolist())
-    missing = [names[label] for label in sorted(judged - seen)]
+    missing = [names[label] for label in sorted(set(reader.labels[reader.labels >= 0].tolist()) - seen)]
     if missing:
         log.warn(
             f"{len(missing)} of {counted(len(names), 'class')} without a training video, so never recognized: {first_names(missing, 8)}"

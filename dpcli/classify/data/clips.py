@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -64,21 +65,57 @@ def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, .
 
 
 class OneVideo:
-    """Holds one sequence of a `clouds` file as a reader that knows no other."""
+    """Holds one video that is no file, or of a stream its last `size` frames, and gives them by number as a reader does.
 
-    def __init__(self, sequence: CloudSequence) -> None:
-        self.path, self.names, self.frame_counts = sequence.name, [sequence.name], [sequence.num_frames]
-        self.fields = tuple(sequence.extra)
-        self._sequence = sequence
+    fields: the names of the kept columns that follow x, y and z in each frame.
+    """
 
-    def read(self, number: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
-        """Returns some frames of the sequence, with the columns among `fields`."""
-        own = self._sequence
-        found = CloudSequence.from_frames(own.name, [own.frame(t) for t in frames])
-        for name in fields:
-            shown = [own.extra[name][own.frame_offsets[t] : own.frame_offsets[t + 1]] for t in frames]
-            found.extra[name] = np.concatenate(shown)
+    def __init__(self, name: str, fields: Sequence[str] = (), size: int | None = None) -> None:
+        self.path, self.names, self.fields, self.size = name, (name,), tuple(fields), size
+        self._frames: deque[np.ndarray] = deque(maxlen=size)
+        self.count = 0  # frames so far
+
+    @classmethod
+    def of(cls, sequence: CloudSequence) -> OneVideo:
+        """Returns a sequence as such a video, with all of its kept columns."""
+        video = cls(sequence.name, tuple(sequence.extra))
+        for frame in frames_with_columns(sequence, video.fields):
+            video.append(frame)
+        return video
+
+    def append(self, points: np.ndarray) -> None:
+        """Takes the next frame, f32 (P,3+F) with the video's columns; the oldest one leaves where there are `size`."""
+        self._frames.append(points)
+        self.count += 1
+
+    @property
+    def frames(self) -> list[np.ndarray]:
+        """Returns the frames that are held, the oldest first."""
+        return list(self._frames)
+
+    @property
+    def first(self) -> int:
+        """Returns the number of the oldest frame that is held."""
+        return self.count - len(self._frames)
+
+    @property
+    def frame_counts(self) -> list[int]:
+        """Returns the number of frames of each video, as a reader does: of this one video, those so far."""
+        return [self.count]
+
+    def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
+        """Returns frames by their number in the video, with all columns; they must still be held."""
+        shown = [self._frames[t - self.first] for t in frames]
+        found = CloudSequence.from_frames(self.names[sequence], [frame[:, :3] for frame in shown])
+        for place, name in enumerate(self.fields, 3):
+            found.extra[name] = np.concatenate([frame[:, place] for frame in shown])
         return found
+
+
+def frames_with_columns(sequence: CloudSequence, fields: Sequence[str]) -> list[np.ndarray]:
+    """Returns the frames f32 (P,3+F) of a sequence, x, y and z with the kept columns of these names."""
+    rows = np.column_stack([sequence.points, *(sequence.extra[name] for name in fields)])
+    return [rows[start:end] for start, end in zip(sequence.frame_offsets, sequence.frame_offsets[1:])]
 
 
 class ClipSource:

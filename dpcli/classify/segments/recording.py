@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.classify.confidence import Confidence, log_probabilities
+from dpcli.classify.data.clips import frames_with_columns
 from dpcli.classify.segments.decoding import best_path, runs
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.runtime.progress import Progress
@@ -49,8 +50,7 @@ def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: in
     times = []
     columns = tuple(map(kept_name, predictor.info.config.columns))
     for block in _blocks(reader, sequence, columns):
-        points = np.column_stack([block.points, *(block.extra[name] for name in columns)])
-        made += [predictor.add(frame) for frame in np.split(points, block.frame_offsets[1:-1])]
+        made += [predictor.add(frame) for frame in frames_with_columns(block, columns)]
         times.append(block.time)
         bar.advance(block.num_frames)
     made.append(predictor.finish())

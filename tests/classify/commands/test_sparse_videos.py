@@ -150,7 +150,7 @@ def test_an_hour_is_one_clip_with_a_warning(tmp_path, capsys):
     times = 54_000 // video.num_frames + 1
     hour = CloudSequence.from_frames("hour", [video.frame(t) for t in range(video.num_frames)] * times)
     hour.extra = {SPEED: np.tile(video.extra[SPEED], times)}
-    source = ClipSource(OneVideo(hour), [0], config, timing="slots")
+    source = ClipSource(OneVideo.of(hour), [0], config, timing="slots")
     clips = source.video_clips(0, None)
     assert len(clips) == 4 and source.load(clips[0], 0).shape == (16, 24, 6)
     with CloudsWriter(tmp_path / "hour.h5", class_names=["up", "down"], fields=[SPEED]) as writer:

@@ -24,14 +24,14 @@ from hypothesis import strategies as st
 
 from dpcli.classify.commands.stream import Speaker, _IrregularFrames
 from dpcli.classify.confidence import Confidence
-from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
+from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
 from dpcli.classify.stream import frame_source as stream_input
 from dpcli.classify.stream.frame_source import open_frames, read_arrays
 from dpcli.classify.stream.read_ahead import ReadAhead
-from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window, window_size
+from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, window_size
 from dpcli.classify.video_scores import batches, score_video
 from dpcli.cli.app import main
 from dpcli.cli.classify import predict as command
@@ -116,7 +116,7 @@ def uniform_file(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("rule", ["center", "height", "unit", "image"])
 def test_a_window_gives_the_points_that_the_whole_file_gives(tmp_path, rule):
     """No rule of normalization may need frames that have left the window."""
-    frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), Window(4)
+    frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), OneVideo("stream", size=4)
     reader = batch_source(frames, tmp_path).reader
     for points in frames:
         window.append(points)
