@@ -25,7 +25,6 @@ from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
-from dpcli.store.schema import kept_name
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -156,7 +155,7 @@ def _score_videos(
     reader, chosen = source.reader, source.sequences
 
     def load(place: int) -> CloudSequence:
-        return reader.read(chosen[place], fields=tuple(map(kept_name, source.config.columns)))
+        return reader.read(chosen[place], fields=source.config.column_fields)
 
     def write(place: int, video: VideoScores) -> dict[str, float]:
         i = chosen[place]

@@ -244,8 +244,7 @@ class ClipSource:
         whole = len(clip.frames) == length and clip.frames == tuple(range(length))
         rows = self._rows.get(number) if whole else None
         if rows is None:
-            fields = tuple(map(kept_name, config.columns))
-            rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
+            rows = slot_rows(self.reader.read(number, clip.frames, fields=config.column_fields), config)
             if whole and self.augmentation != NONE:
                 self._rows[number] = rows
         made = in_slots(changed_rows(rows, self.augmentation, config.signed_columns, rng), config, rng)
@@ -270,9 +269,9 @@ def check_columns(reader: CloudsReader | OneVideo, config: KinetConfig) -> None:
     fields = getattr(reader, "fields", ())
     missing = [name for name in config.columns if kept_name(name) not in fields]
     if missing:
-        read = {*map(kept_name, config.columns)}
-        others = [name.removeprefix(KEPT) for name in fields if name.startswith(KEPT) and name not in read]
-        has = f" (the file has {', '.join(sorted(others))}: if one is the same by another name, call it so in the raw data)"
+        kept = [name for name in fields if name.startswith(KEPT) and name not in config.column_fields]
+        others = sorted(name.removeprefix(KEPT) for name in kept)
+        has = f" (the file has {', '.join(others)}: if one is the same by another name, call it so in the raw data)"
         raise DataError(
             f"{reader.path}: no column {', '.join(missing)}, which the network reads of every point; prepare the file with"
             f" --keep-fields {','.join(config.columns)}{has if others else ''}"

@@ -9,6 +9,7 @@ from typing import Literal
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.fields import WIDEST, check, setting
 from dpcli.runtime.settings.stored import from_json
+from dpcli.store.schema import kept_name
 
 CROSS = "cross"  # the rule of validation by which every video is judged by members that never saw it
 
@@ -170,6 +171,11 @@ class KinetConfig:
             )
         self._check_reach("temporal_radius", self.temporal_radius)
         self._check_reach("static_temporal_radius", self.static_radius)
+
+    @property
+    def column_fields(self) -> tuple[str, ...]:
+        """Returns the names of the columns as fields of a clouds file."""
+        return tuple(map(kept_name, self.columns))
 
     @property
     def signed_columns(self) -> list[int]:

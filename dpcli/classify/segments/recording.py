@@ -14,7 +14,6 @@ from dpcli.classify.segments.decoding import best_path, runs
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.schema import kept_name
 from dpcli.store.tables.segments import Segment
 
 _CHANGE = 0.3  # what a change of class costs, in windows of full certainty; docs/experiments/classify.md, 2026-11-28
@@ -48,7 +47,7 @@ def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: in
     """Returns what the windows of a recording say; some hundred frames are in memory at a time."""
     made: list[Prediction | None] = []
     times = []
-    columns = tuple(map(kept_name, predictor.info.config.columns))
+    columns = predictor.info.config.column_fields
     for block in _blocks(reader, sequence, columns):
         made += [predictor.add(frame) for frame in frames_with_columns(block, columns)]
         times.append(block.time)

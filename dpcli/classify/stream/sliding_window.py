@@ -15,7 +15,6 @@ from dpcli.classify.video_scores import clip_scores
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.seeds import generator
-from dpcli.store.schema import kept_name
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class StreamPredictor:
         if hop < 1:
             raise UsageError(f"--hop {hop}: expected at least 1 frame")
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
-        self.window = OneVideo("stream", tuple(map(kept_name, info.config.columns)), window_size(info, window))
+        self.window = OneVideo("stream", info.config.column_fields, window_size(info, window))
         self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
         self.streams = info.streams
         self.clips = 0
