@@ -15,7 +15,7 @@ from torch import nn
 
 from dpcli.classify.network.backbones.interface import Grouping
 from dpcli.classify.network.kinet import Kinet, fuse
-from dpcli.runtime.tuning import torch_threads
+from dpcli.runtime.tuning import keep_freed_memory, torch_threads
 
 _STEPS = 4  # of each kind that are timed
 _STARTS = 5  # the argument of the backward kernels that says where each row's pooled entries are
@@ -60,8 +60,6 @@ def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[
     sparse products, which lie inside other kernels of the static stream: see `_sparse_products`. The fastest of _STEPS
     steps, because other programs only ever add time, and to the parts unequally.
     """
-    from dpcli.runtime.tuning import keep_freed_memory
-
     keep_freed_memory()
     config = model.config
     points = body_like_clip(config.num_frames, config.points_per_frame, batch).to(device)

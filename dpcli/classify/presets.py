@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from dpcli.classify.data.augment import AUGMENTATIONS
-from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.config import RELEASE, KinetConfig
 from dpcli.classify.training.run_settings import RunSettings
 from dpcli.classify.training.schedule import Schedule
 
@@ -84,20 +84,8 @@ PRESETS = {
 }
 
 # What `variant` means: the fields in which the published code differs from the thesis's text, with the values of each.
-_DIFFERING = (
-    "variant",
-    "group_size",
-    "xyz_group",
-    "time_input",
-    "weighting",
-    "merge",
-    "guard",
-    "fusion",
-    "grouping",
-    "static_temporal_radius",
-)
 VARIANT_CHANGES: dict[str, dict[str, Any]] = {
-    name: {key: getattr(config, key) for key in _DIFFERING}
+    name: {key: getattr(config, key) for key in (*RELEASE, "static_temporal_radius")}
     for name, config in (("thesis", KinetConfig()), ("release", KinetConfig.release()))
 }
 

@@ -43,7 +43,6 @@ class TrainingSettings:
                 f"augment_speed = {speed:g}: speed changes random clips of consecutive frames; leave it out with --timing"
                 " uniform or clips_per_video = 0"
             )
-
         if self.run.validation == CROSS and self.network.members < 2:
             raise UsageError(
                 "--validation cross: needs a network of several members, as preset sparse has; give another rule"

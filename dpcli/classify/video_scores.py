@@ -16,7 +16,6 @@ from dpcli.classify.network.kinet import STREAMS, Kinet, fuse
 class VideoScores:
     """Holds the mean probabilities (C) of one video, fused and by stream, and how many clips they come from."""
 
-    sequence: int
     fused: np.ndarray
     streams: dict[str, np.ndarray]
     clips: int
@@ -31,24 +30,23 @@ def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[
 
 
 @torch.inference_mode()
-def predict_videos(
+def score_video(
     model: Kinet,
     source: ClipSource,
+    sequence: int,
     clips_per_video: int | None,
     batch: int,
     device: torch.device | str,
     streams: Sequence[str] = STREAMS,
-) -> Iterator[VideoScores]:
-    """Yields the scores of every video of `source`, in order, one video in memory at a time.
+) -> VideoScores:
+    """Returns the scores of a video; a batch holds its clips alone, so that they are the same whatever is scored beside it.
 
-    A batch holds clips of one video only, so that a video's scores are the same whatever is scored beside it. streams:
-    those that were trained; with the static one alone, its scores are the fused ones.
+    streams: those that were trained; with the static one alone, its scores are the fused ones.
     """
-    for sequence in source.sequences:
-        clips = source.video_clips(sequence, clips_per_video)
-        found = [clip_scores(model, points.to(device), streams).cpu() for _, points in batches(source, clips, batch)]
-        fused, *single = torch.cat(found, 1).mean(1).numpy()
-        yield VideoScores(sequence, fused, dict(zip(streams, single)), len(clips))
+    clips = source.video_clips(sequence, clips_per_video)
+    found = [clip_scores(model, points.to(device), streams).cpu() for _, points in batches(source, clips, batch)]
+    fused, *single = torch.cat(found, 1).mean(1).numpy()
+    return VideoScores(fused, dict(zip(streams, single)), len(clips))
 
 
 def clip_scores(model: Kinet, points: torch.Tensor, streams: Sequence[str]) -> torch.Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.descriptors import descriptors
 from dpcli.classify.data.likeness import tell_mixed_sizes
-from dpcli.classify.data.validation_split import about_other_splits
+from dpcli.classify.data.validation_split import about_other_splits, class_table
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
@@ -57,9 +56,7 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
     refuse_repeats([data, *([output] if output else [])])
     if output not in (None, "-"):
         refuse_existing(str(output), force)
-    with ExitStack() as stack:
-        path = stack.enter_context(input_file(data))
-        reader = stack.enter_context(CloudsReader(path))
+    with input_file(data) as path, CloudsReader(path) as reader:
         known = np.flatnonzero(reader.labels >= 0)
         if not len(known):
             raise DataError(f"{path}: no video has a label; prepare them with --labels TABLE or --label-from-folder")
@@ -70,13 +67,14 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         if left_out:
             log.info(f"{path}: columns read: {', '.join(columns) or 'none'}{not_read(left_out)}")
         values = descriptors(reader, known.tolist(), columns)
-        scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
+        names = class_table(reader)
+        scores = np.full((len(known), len(names)), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         _tell_left_out(reader, known)
         tell_mixed_sizes(reader, known.tolist())
         tell_copies(reader, [(known[learned].tolist(), known[judged].tolist()) for learned, judged in rounds])
         for learned, judged in rounds:
-            scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)
+            scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], len(names), seed)
         judged = np.flatnonzero(np.isfinite(scores[:, 0]))
         _tell_unknown_classes(reader, labels, rounds, len(judged))
         if output:
@@ -90,7 +88,7 @@ def forest_accuracy(reader: CloudsReader, learned: list[int], judged: list[int],
     """Returns the share of the labeled sequences `judged` that a forest which saw the sequences `learned` gets right."""
     columns, _ = telling_columns(reader, learned, by_class=False)
     known, asked = (descriptors(reader, some, columns) for some in (learned, judged))
-    scores = _forest_scores(known, reader.labels[learned], asked, int(reader.labels.max()) + 1, seed)
+    scores = _forest_scores(known, reader.labels[learned], asked, len(class_table(reader)), seed)
     return float((scores.argmax(1) == reader.labels[judged]).mean())
 
 
@@ -139,7 +137,7 @@ def _tell_unknown_classes(
     """Warns of judged videos whose class no forest that judged them had learned: they can't be right."""
     lost = np.concatenate([own[~np.isin(labels[own], labels[learned])] for learned, own in rounds])
     if len(lost):
-        table = reader.class_names or [str(label) for label in range(int(labels.max()) + 1)]
+        table = class_table(reader)
         names = [table[label] for label in np.unique(labels[lost])]
         log.warn(
             f"{reader.path}: {len(lost)} of {counted(judged, 'judged video')} count as wrong, since no other video of their"
@@ -174,8 +172,8 @@ def _write(
 ) -> None:
     with output_file(output) as target:
         entry = provenance.record({"baseline": "forest", "trees": TREES}, seed, {"data": reader.path})
-        names = reader.class_names or [str(label) for label in range(scores.shape[1])]
-        with ScoresWriter(target, class_names=names, source=reader.path.name, provenance=entry, force=force) as writer:
+        words = {"class_names": class_table(reader), "source": reader.path.name, "provenance": entry, "force": force}
+        with ScoresWriter(target, **words) as writer:
             for sequence, row in zip(sequences, scores):
                 name, label, split = reader.names[sequence], int(reader.labels[sequence]), reader.splits[sequence]
                 writer.write(name, row, label=label, split=split)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dpcli.classify.network.kinet import STREAMS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import UsageError
 from dpcli.runtime.whole_file import check_target, refuse_existing
@@ -13,10 +12,9 @@ from dpcli.runtime.whole_file import check_target, refuse_existing
 
 def chosen_streams(text: str | None, info: ModelInfo) -> tuple[str, ...]:
     """Returns the streams that a text names, each once; without a text those that were trained. Raises UsageError on others."""
-    trained = tuple(info.notes.get("streams", STREAMS))
-    possible = (*trained, "fused") if len(trained) > 1 else trained
+    possible = (*info.streams, "fused") if len(info.streams) > 1 else info.streams
     if text is None:
-        return trained
+        return info.streams
     chosen = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
     if not chosen or not set(chosen) <= set(possible):
         raise UsageError(

@@ -14,13 +14,12 @@ import torch
 from dpcli.classify.commands.explain_inputs import check_targets, chosen_streams
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.likeness import tell_unlike_file
-from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
+from dpcli.classify.data.videos import check_classes, select_videos
 from dpcli.classify.explain.pac_settings import PacSettings
 from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
 from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.draw.view import default_view, parse_view
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
@@ -66,8 +65,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     pictures = ((request.picture, "--picture", PICTURES), (request.animation, "--animation", ANIMATIONS))
     check_targets(str(task.output), task.force, *pictures)
     device = choose_device(task.device)
-    weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    model, info = load_model(task.model, task.backbone)
     streams = chosen_streams(request.stream, info)
     stage = None if settings.stage is None else settings.stage - 1
     question = Question(settings.rule, stage, _target(settings.target, info.class_names))
@@ -77,12 +75,8 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
         axes = parse_view(settings.view or default_view(reader.length_unit))
         pool = _pool(reader, request.samples, task, info)
         sequences = chosen_samples(reader, request.samples, pool)
-        source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=task.seed)
-        report_short(source, info.config.num_frames)
-        report_backward(reader, source.sequences)
-        report_gaps(reader, source.sequences)
-        tell_unlike_file(reader, source.sequences, info, task.model)
-        entry = provenance.record(_record(task, weights, request, streams, info), task.seed, {"clouds": path})
+        source = task.clips(reader, sequences, info)
+        entry = provenance.record(_record(task, request, streams, info), task.seed, {"clouds": path})
         clouds = _explain(model.to(device), source, streams, question, device)
         write_clouds(
             place,
@@ -103,9 +97,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     return Explained(points, len(clouds), info.config.num_frames)
 
 
-def _record(
-    task: ModelTask, weights: Path, request: PacRequest, streams: Sequence[str], info: ModelInfo
-) -> dict[str, Any]:
+def _record(task: ModelTask, request: PacRequest, streams: Sequence[str], info: ModelInfo) -> dict[str, Any]:
     """Returns what shapes the activations, for the file's provenance."""
     return {
         "streams": list(streams),
@@ -114,8 +106,7 @@ def _record(
         "stage": request.settings.stage,
         "samples": request.samples,
         "split": task.split,
-        "weights": provenance.file_digest(weights),
-        "model": info.notes,
+        **task.model_record(info),
     }
 
 

@@ -10,9 +10,7 @@ import numpy as np
 
 from dpcli.classify.commands.explain_inputs import check_targets, chosen_streams
 from dpcli.classify.commands.model_task import ModelTask
-from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.likeness import tell_unlike_file
-from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
+from dpcli.classify.data.videos import check_classes, select_videos
 from dpcli.classify.explain.pictures import plane_picture
 from dpcli.classify.explain.tsne import (
     NEIGHBORS,
@@ -23,7 +21,7 @@ from dpcli.classify.explain.tsne import (
     silhouette,
     video_features,
 )
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.counted import counted
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -90,35 +88,27 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
     """
     check_targets(str(task.output), task.force, (request.picture, "--picture", FIGURES))
     device = choose_device(task.device)
-    weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    model, info = load_model(task.model, task.backbone)
     streams = chosen_streams(request.stream, info)
     with input_file(task.data) as path, output_file(task.output) as place:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
         sequences = select_videos(reader, task.split, info, task.model)
-        source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=task.seed)
-        kept = source.sequences
-        perplexity = chosen_perplexity(request.perplexity, len(kept))
-        report_short(source, info.config.num_frames)
-        report_backward(reader, source.sequences)
-        report_gaps(reader, source.sequences)
-        tell_unlike_file(reader, source.sequences, info, task.model)
+        perplexity = chosen_perplexity(request.perplexity, len(sequences))
+        source = task.clips(reader, sequences, info)
         keep_freed_memory()
         features = video_features(model.to(device), source, request.clips_per_video, request.batch, device)
         if "fused" in streams:
             features["fused"] = joined_features(features)
-        labels = reader.labels[kept]
+        labels = reader.labels[sequences]
         _tell_what_is_missing(labels)
         embeddings = {s: _embedding(features[s], labels, perplexity, task.seed) for s in streams}
-        entry = provenance.record(
-            _record(task, weights, request, streams, perplexity, info), task.seed, {"clouds": path}
-        )
+        entry = provenance.record(_record(task, request, streams, perplexity, info), task.seed, {"clouds": path})
         write_embedding(
             place,
-            [reader.names[i] for i in kept],
+            [reader.names[i] for i in sequences],
             labels,
-            [reader.splits[i] for i in kept],
+            [reader.splits[i] for i in sequences],
             embeddings,
             class_names=info.class_names,
             source=task.source,
@@ -134,7 +124,7 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
 
 
 def _record(
-    task: ModelTask, weights: Path, request: TsneRequest, streams: tuple[str, ...], perplexity: float, info: ModelInfo
+    task: ModelTask, request: TsneRequest, streams: tuple[str, ...], perplexity: float, info: ModelInfo
 ) -> dict[str, Any]:
     """Returns what shapes the map, for the file's provenance."""
     return {
@@ -142,8 +132,7 @@ def _record(
         "split": task.split,
         "perplexity": perplexity,
         "clips_per_video": request.clips_per_video,
-        "weights": provenance.file_digest(weights),
-        "model": info.notes,
+        **task.model_record(info),
     }
 
 

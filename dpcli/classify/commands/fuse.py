@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,21 @@ class Fusion:
     complete: bool = False
 
 
+@dataclass(frozen=True)
+class _Aligned:
+    """Holds the scores f32 (K,S,C) that K streams give to the same S videos, in one order, and what is known of the videos.
+
+    labels: i32 (S), -1 where no file knows one; splits: "" likewise.
+    """
+
+    streams: list[str]
+    scores: np.ndarray
+    class_names: list[str]
+    names: list[str]
+    labels: np.ndarray
+    splits: list[str]
+
+
 def fuse(
     inputs: Sequence[str],
     output: str,
@@ -58,27 +72,30 @@ def fuse(
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
         readers = [ScoresReader(path) for path in paths]
-        streams, sources, rows = _streams(readers, called)
-        shares = parse_weights(weights, streams, len(inputs) == 1)
+        made = _aligned(readers, called)
+        shares = parse_weights(weights, made.streams, len(inputs) == 1)
         _tell_rejected(readers, called)
         if judges:
             held = [ScoresReader(name) for name in judges]
             _tell_other_models(held, judges, readers, called)
-            shares = _chosen_weights(held, judges, streams, sources[0], mean)
-        config = _record(streams, mean, shares, readers, judges)
+            shares = _chosen_weights(held, judges, made, mean)
+        config = _record(made.streams, mean, shares, readers, judges)
         entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
-        fusion = Fusion(len(sources[0].names), dict(zip(streams, shares.tolist())))
+        fusion = Fusion(len(made.names), dict(zip(made.streams, shares.tolist())))
         if not force and already_made(target, entry, ScoresReader, WORK):
-            return Fusion(fusion.videos, fusion.weights, complete=True)
+            return replace(fusion, complete=True)
         with ScoresWriter(
             target,
-            class_names=sources[0].class_names,
+            class_names=made.class_names,
             source=", ".join(Path(name).name for name in called),
             provenance=entry,
-            streams=streams,
+            streams=made.streams,
             force=force,
         ) as writer:
-            _write(writer, sources, rows, streams, shares, mean)
+            main = mean_scores(made.scores, shares, mean)
+            for row, name in enumerate(made.names):
+                own = dict(zip(made.streams, made.scores[:, row]))
+                writer.write(name, main[row], label=int(made.labels[row]), split=made.splits[row], streams=own)
     return fusion
 
 
@@ -115,10 +132,12 @@ def _record(
     return config
 
 
-def _streams(
-    readers: Sequence[ScoresReader], called: Sequence[str]
-) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
-    """Returns what is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
+def _aligned(readers: Sequence[ScoresReader], called: Sequence[str]) -> _Aligned:
+    """Returns what is averaged, in the order of the first file: the scores of several files, or of one file its streams.
+
+    A label or a split that only some files know is taken from these. Raises DataError for scores that are no probabilities and
+    files of different videos, UsageError for one file without streams.
+    """
     for reader, name in zip(readers, called):
         for stream, scores in (("scores", reader.scores), *reader.streams.items()):
             bad = np.flatnonzero((scores < 0).any(1) | (np.abs(scores.sum(1, dtype=np.float64) - 1) > _OFF))
@@ -127,21 +146,19 @@ def _streams(
                     f"{name}: {stream} of {reader.names[bad[0]]!r} are not probabilities ({len(bad)} such samples); "
                     "expected numbers from 0 up whose sum is 1, as from a softmax"
                 )
-    if len(readers) > 1:
-        return stream_names(short_names(called)), list(readers), matching_rows(readers, called)
-    if len(readers[0].streams) < 2:
+    first = readers[0]
+    if len(readers) == 1 and len(first.streams) < 2:
         raise UsageError(f"{called[0]}: one file without streams to fuse; name two or more files")
-    views = []
-    for scores in readers[0].streams.values():
-        view = copy(readers[0])
-        view.scores = scores
-        views.append(view)
-    return list(readers[0].streams), views, [np.arange(len(readers[0].names))] * len(views)
-
-
-def _labels(sources: Sequence[ScoresReader], rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns the labels i32 (S); one that only some files know is taken from them."""
-    return np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
+    rows = matching_rows(readers, called)
+    if len(readers) == 1:
+        streams, scores = list(first.streams), np.stack(list(first.streams.values()))
+    else:
+        streams = stream_names(short_names(called))
+        scores = np.stack([reader.scores[at] for reader, at in zip(readers, rows)])
+    labels = np.max([reader.labels[at] for reader, at in zip(readers, rows)], axis=0)
+    known = zip(*([reader.splits[row] for row in at] for reader, at in zip(readers, rows)))
+    splits = [next(filter(None, own), "") for own in known]
+    return _Aligned(streams, scores, first.class_names, first.names, labels, splits)
 
 
 def _tell_rejected(readers: Sequence[ScoresReader], called: Sequence[str]) -> None:
@@ -173,28 +190,27 @@ def _model_digest(reader: ScoresReader) -> str | None:
     return config.get("weights") if isinstance(config, dict) and "model" in config else None
 
 
-def _chosen_weights(
-    held: Sequence[ScoresReader], judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str
-) -> np.ndarray:
+def _chosen_weights(held: Sequence[ScoresReader], judges: Sequence[str], fused: _Aligned, mean: str) -> np.ndarray:
     """Returns weights chosen on labeled videos that are not among the fused ones. Raises DataError when they don't fit."""
-    names, sources, rows = _streams(held, judges)
-    if len(judges) == 1 and names != list(streams):
-        raise DataError(f"{judges[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
-    _same_classes(fused.class_names, sources[0].class_names, "what is fused", judges[0])
-    both = sorted(set(fused.names) & set(sources[0].names))
+    own = _aligned(held, judges)
+    if len(judges) == 1 and own.streams != fused.streams:
+        raise DataError(
+            f"{judges[0]}: streams {', '.join(own.streams)}; expected {', '.join(fused.streams)}, as in what is fused"
+        )
+    _same_classes(fused.class_names, own.class_names, "what is fused", judges[0])
+    both = sorted(set(fused.names) & set(own.names))
     if both:
         raise DataError(
             f"{judges[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
             "on other videos, such as those held out of training (predict --split validation)"
         )
-    labels = _labels(sources, rows)
-    known = np.flatnonzero(labels >= 0)
-    if not len(known):
+    known = own.labels >= 0
+    if not known.any():
         raise DataError(f"{judges[0]}: no video has a label; weights are chosen on labeled videos")
-    scores = np.stack([source.scores[at][known] for source, at in zip(sources, rows)])
+    scores, labels = own.scores[:, known], own.labels[known]
     if mean == "geometric":
-        return geometric_weights(scores, labels[known])
-    return likelihood_weights(scores[:, np.arange(len(known)), labels[known]])
+        return geometric_weights(scores, labels)
+    return likelihood_weights(scores[:, np.arange(len(labels)), labels])
 
 
 def stream_names(wanted: Sequence[str]) -> list[str]:
@@ -266,20 +282,3 @@ def _same_truth(
                 f"{other}: {one.names[row]!r} is of split {b!r}, in {first} of {a!r}; "
                 "these are scores of different data"
             )
-
-
-def _write(
-    writer: ScoresWriter,
-    sources: Sequence[ScoresReader],
-    rows: Sequence[np.ndarray],
-    streams: Sequence[str],
-    shares: np.ndarray,
-    mean: str,
-) -> None:
-    """Writes the videos in the first file's order; unknown labels and splits are taken from the files that know them."""
-    own = np.stack([source.scores[at] for source, at in zip(sources, rows)])  # (files, S, C)
-    main = mean_scores(own, shares, mean)
-    labels = _labels(sources, rows)
-    for row, name in enumerate(sources[0].names):
-        split = next((s.splits[at[row]] for s, at in zip(sources, rows) if s.splits[at[row]]), "")
-        writer.write(name, main[row], label=int(labels[row]), split=split, streams=dict(zip(streams, own[:, row])))

@@ -10,12 +10,12 @@ from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
-from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.likeness import tell_long, tell_unlike_file
-from dpcli.classify.data.videos import check_classes, report_backward, report_gaps, report_short, select_videos
-from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.classify.data.clips import LOOKS, ClipSource, OneVideo
+from dpcli.classify.data.likeness import tell_long
+from dpcli.classify.data.videos import check_classes, select_videos
+from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
-from dpcli.classify.video_scores import VideoScores, predict_videos
+from dpcli.classify.video_scores import VideoScores, score_video
 from dpcli.counted import counted
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
@@ -25,7 +25,6 @@ from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
-from dpcli.store.schema import kept_name
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -52,11 +51,11 @@ class ScoreVideo:
     streams: tuple[str, ...]
     seed: int
 
-    def __call__(self, numbered: tuple[int, CloudSequence]) -> VideoScores:
-        """Returns the scores of a sequence; numbered: with its number in the file."""
-        (number, sequence), (model, info) = numbered, self.model.get()
-        source = ClipSource(OneVideo(number, sequence), [number], info.config, timing=info.timing, seed=self.seed)
-        return next(predict_videos(model, source, self.clips_per_video, self.batch, self.device, self.streams))
+    def __call__(self, sequence: CloudSequence) -> VideoScores:
+        """Returns the scores of a sequence."""
+        model, info = self.model.get()
+        source = ClipSource(OneVideo.of(sequence), [0], info.config, timing=info.timing, seed=self.seed)
+        return score_video(model, source, 0, self.clips_per_video, self.batch, self.device, self.streams)
 
 
 def predict(
@@ -70,8 +69,8 @@ def predict(
     """Scores the videos and writes a scores file; goes on where a stopped run ended.
 
     clips_per_video: spread evenly over a video, None takes every start. reject_below: see `choose_confidence`; None marks
-    nothing as rejected. spread: who works on which videos. Raises UsageError
-    when the output holds something else, DataError when data and model don't fit.
+    nothing as rejected. spread: who works on which videos. Raises UsageError when the output holds something else, DataError
+    when data and model don't fit.
     """
     weights = find_model(task.model)
     open_model = partial(_open_model, weights.resolve(), task.backbone, task.device)  # workers may stand elsewhere
@@ -80,13 +79,14 @@ def predict(
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
         sequences = select_videos(reader, task.split, info, task.model)
-        source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
-        report_short(source, info.config.num_frames)
-        report_backward(reader, source.sequences)
-        report_gaps(reader, source.sequences)
-        tell_unlike_file(reader, source.sequences, info, task.model)
+        source = task.clips(reader, sequences, info, drop_short=drop_short)
         tell_long(reader, source.sequences, info, task.model)
-        config = _record(task, weights, info, source, clips_per_video)
+        if info.timing == "slots" and (clips_per_video or 0) > LOOKS:
+            log.info(
+                f"--clips-per-video {clips_per_video}: {task.model} is for sparse clouds, whose clips are whole videos; {LOOKS}"
+                " of each are taken, the most there are"
+            )
+        config = _record(task, info, source, clips_per_video)
         confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)
         if confidence is not None:
             config["reject_below"] = {"temperature": confidence.temperature, "threshold": confidence.threshold}
@@ -116,17 +116,14 @@ def _open_model(weights: Path, backbone: str | None, device: str) -> tuple[Kinet
     return model.to(chosen), info
 
 
-def _record(
-    task: ModelTask, weights: Path, info: ModelInfo, source: ClipSource, clips_per_video: int | None
-) -> dict[str, Any]:
+def _record(task: ModelTask, info: ModelInfo, source: ClipSource, clips_per_video: int | None) -> dict[str, Any]:
     """Returns what shapes the scores, for the file's provenance."""
     return {
         "split": task.split,
         "clips_per_video": clips_per_video,
         "drop_short": source.drop_short,
         "dropped": source.dropped,
-        "model": info.notes,
-        "weights": provenance.file_digest(weights),
+        **task.model_record(info),
         "fusion": info.config.fusion,
     }
 
@@ -138,7 +135,7 @@ def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict],
         seed=task.seed,
         source=task.source,
         provenance=history,
-        streams=tuple(info.notes.get("streams", STREAMS)),
+        streams=info.streams,
         rejects=rejects,
         force=task.force,
         resume=task.output != "-",
@@ -157,11 +154,11 @@ def _score_videos(
     their file does."""
     reader, chosen = source.reader, source.sequences
 
-    def load(place: int) -> tuple[int, CloudSequence]:
-        return chosen[place], reader.read(chosen[place], fields=tuple(map(kept_name, source.config.columns)))
+    def load(place: int) -> CloudSequence:
+        return reader.read(chosen[place], fields=source.config.column_fields)
 
     def write(place: int, video: VideoScores) -> dict[str, float]:
-        i = video.sequence
+        i = chosen[place]
         label, own = int(reader.labels[i]), split or reader.splits[i]
         rejected = bool(confidence.of(video.fused).max() < confidence.threshold)
         writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams, rejected=rejected)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,8 +13,7 @@ from dpcli.classify.confidence import choose_confidence
 from dpcli.classify.data.clips import check_columns
 from dpcli.classify.data.likeness import tell_unlike_file
 from dpcli.classify.data.videos import check_classes, report_empty, report_gaps, select_videos
-from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
 from dpcli.classify.stream.sliding_window import StreamPredictor, window_size
 from dpcli.counted import counted
@@ -47,10 +46,9 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
     Raises UsageError for options that don't fit the model and for an output that exists, DataError for bad recordings.
     """
     suffix = _suffix(task)
-    weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    model, info = load_model(task.model, task.backbone)
     how = _cutting(info, options, task.model)
-    new_predictor = _predictors(model, info, how, task)
+    device = choose_device(task.device)
     with input_file(task.data) as path:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
@@ -62,9 +60,10 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
         recordings = {}
         with Progress("classify predict --segments", int(reader.frame_counts[chosen].sum()), "frame") as bar:
             for i in chosen:
-                scored = _with_true_times(score_windows(new_predictor(), reader, i, bar), reader.names[i])
+                predictor = StreamPredictor(model, info, window=how.window, hop=how.hop, seed=task.seed, device=device)
+                scored = _with_true_times(score_windows(predictor, reader, i, bar), reader.names[i])
                 recordings[reader.names[i]] = cut(scored, info.class_names, how)
-        entry = provenance.record(_record(weights, info, how, task), task.seed, {"clouds": path})
+        entry = provenance.record(_record(task, info, how), task.seed, {"clouds": path})
         found = Segments(recordings, info.class_names, [*reader.provenance, entry])
     text = segments_text(found, suffix)
     if task.output != "-":
@@ -111,15 +110,6 @@ def _cutting(info: ModelInfo, options: SegmentOptions, model: str) -> Cutting:
     return Cutting(window, hop, shortest, choose_confidence(info.notes, options.reject_below, model))
 
 
-def _predictors(model: Kinet, info: ModelInfo, how: Cutting, task: ModelTask) -> Callable[[], StreamPredictor]:
-    device, window = choose_device(task.device), how.window if info.timing != "clips" else None
-
-    def new() -> StreamPredictor:
-        return StreamPredictor(model, info, window=window, hop=how.hop, seed=task.seed, device=device)
-
-    return new
-
-
 def _with_true_times(found: WindowScores, name: str) -> WindowScores:
     """Returns the scores without times where these don't rise, and says so: a frame's number is then all that tells when."""
     if found.time is None:
@@ -136,14 +126,13 @@ def _with_true_times(found: WindowScores, name: str) -> WindowScores:
     return replace(found, time=None)
 
 
-def _record(weights: Path, info: ModelInfo, how: Cutting, task: ModelTask) -> dict[str, object]:
+def _record(task: ModelTask, info: ModelInfo, how: Cutting) -> dict[str, object]:
     """Returns what shapes the segments, for their provenance."""
     return {
         "segments": {"window": how.window, "hop": how.hop, "shortest": how.shortest},
         "confidence": how.confidence.notes(),
         "split": task.split,
-        "model": info.notes,
-        "weights": provenance.file_digest(weights),
+        **task.model_record(info),
     }
 
 

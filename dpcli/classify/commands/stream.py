@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.likeness import like, tell_unlike, tell_values
 from dpcli.classify.data.videos import SILENT
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
 from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
@@ -31,6 +32,9 @@ from dpcli.store import ScoresWriter
 
 _CTRL_C = "SIGINT"
 _SPARSE = 4  # points: fewer show no shape
+# the kinds of irregular frames, as they are summed up
+_EMPTY, _PADDED = "without points, left out", "with points at the origin, left out"
+_THIN, _LATE = f"of fewer than {_SPARSE} points", "after a silence"
 
 
 class Listener(Protocol):
@@ -78,8 +82,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     new_listener: makes the one who takes the predictions. Returns the number of frames.
     Raises what ended the stream early.
     """
-    weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    model, info = load_model(task.model, task.backbone)
     device = choose_device(task.device)
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
     confidence = choose_confidence(info.notes, options.reject_below, task.model)
@@ -88,14 +91,13 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     keep_freed_memory()
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
-        watch = _IrregularFrames(
-            info.timing == "slots", predictor.window.size, lambda first: _tell_unlike(task, info, first)
-        )
-        problem = _follow(predictor, frames, new_listener(speaker), stop, watch)
+        watch = _IrregularFrames(info.timing == "slots")
+        tell = partial(_tell_unlike, task, info)
+        problem = _follow(predictor, frames, new_listener(speaker), stop, watch, tell)
         if not predictor.clips:
-            raise problem or _nothing_seen(task.source, watch.empty)
+            raise problem or _nothing_seen(task.source, watch.counts[_EMPTY])
         if target is not None:
-            target.provenance.append(provenance.record(_record(weights, options, info, predictor), task.seed))
+            target.provenance.append(provenance.record(_record(task, options, info, predictor), task.seed))
             fused, *single = predictor.mean
             target.write(Path(task.source).stem, fused, streams=dict(zip(predictor.streams, single)))
     if task.output:
@@ -116,15 +118,14 @@ def _writer(task: ModelTask, info: ModelInfo, predictor: StreamPredictor) -> Sco
     )
 
 
-def _record(weights: Path, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
+def _record(task: ModelTask, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
     """Returns what shapes the scores, for the file's provenance."""
     return {
         "stream": True,
         "hop": options.hop,
         "window": predictor.window.size,
         "frames": predictor.window.count,
-        "model": info.notes,
-        "weights": provenance.file_digest(weights),
+        **task.model_record(info),
         "fusion": info.config.fusion,
     }
 
@@ -149,20 +150,27 @@ def _follow(
     lines: Listener,
     stop: StopRequest,
     watch: _IrregularFrames,
+    tell_unlike_first: Callable[[list[np.ndarray]], None],
 ) -> BaseException | None:
-    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
-    feed = ReadAhead(frames, 2 * predictor.window.size)
+    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did.
+
+    tell_unlike_first: compares the frames of the first window with what the model learned from.
+    """
+    window = predictor.window
+    feed = ReadAhead(frames, 2 * window.size)
     problem: BaseException | None = None
     arrived = time.monotonic()
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
-            silent = waited if predictor.window.count else 0.0
-            points = watch.see(predictor.window.count, points, silent)
+            silent = waited if window.count else 0.0
+            points = watch.see(window.count, points, silent)
             if not len(points):  # `dpc prepare` leaves such frames out, so the model learned from videos without them
                 continue
             lines.see(points[:, :3], silent)
             made = predictor.add(points)
+            if window.count == window.size:
+                tell_unlike_first(window.frames)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
     except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
@@ -172,10 +180,12 @@ def _follow(
     finally:
         feed.close()
     if (made := predictor.finish()) is not None:
-        log.info(f"{counted(predictor.window.count, 'frame')}, fewer than the window's {predictor.window.size}")
+        log.info(f"{counted(window.count, 'frame')}, fewer than the window's {window.size}")
         lines.write(made, time.monotonic() - arrived, feed.waiting)
+    if 0 < window.count < window.size:
+        tell_unlike_first(window.frames)
     watch.sum_up()
-    count = predictor.window.count
+    count = window.count
     if stop.requested and problem is None and stop.name == _CTRL_C:
         problem = KeyboardInterrupt()
     elif stop.requested and problem is None:
@@ -196,16 +206,11 @@ def _tell_unlike(task: ModelTask, info: ModelInfo, first: list[np.ndarray]) -> N
 class _IrregularFrames:
     """Warns of the first empty, sparse or late frame at once, and counts them at the end.
 
-    few: whether frames of few points are what the model takes. window, compare: so many frames are first compared
-    with what the model learned from.
+    few: whether frames of few points are what the model takes.
     """
 
-    def __init__(
-        self, few: bool = False, window: int = 0, compare: Callable[[list[np.ndarray]], None] = lambda first: None
-    ) -> None:
-        self.empty = self.padded = self.sparse = self.gaps = 0
-        self._few, self._window, self._compare = few, window, compare
-        self._first: list[np.ndarray] = []
+    def __init__(self, few: bool = False) -> None:
+        self.counts, self._few = dict.fromkeys((_EMPTY, _PADDED, _THIN, _LATE), 0), few
 
     def see(self, number: int, points: np.ndarray, silent: float) -> np.ndarray:
         """Returns a frame without what stands for nothing seen, as `dpc prepare` writes it.
@@ -213,51 +218,29 @@ class _IrregularFrames:
         number: how many frames with points came before it; silent: the seconds since the one before.
         """
         if silent > SILENT:
-            if not self.gaps:
-                log.warn(
-                    f"nothing came for {silent:.1f} s before frame {number}: the frames before and after it count as"
-                    " neighbors; reported once"
-                )
-            self.gaps += 1
+            what = f"nothing came for {silent:.1f} s before frame {number}"
+            self._count(_LATE, f"{what}: the frames before and after it count as neighbors")
         seen = without_padding(points)
         if 0 < len(seen) < len(points):
-            if not self.padded:
-                log.warn(
-                    f"frame {number} has {len(points) - len(seen)} points at the origin, which stand for nothing seen: they are"
-                    " left out, as `dpc prepare` does; reported once"
-                )
-            self.padded += 1
+            what = f"frame {number} has {len(points) - len(seen)} points at the origin, which stand for nothing seen"
+            self._count(_PADDED, f"{what}: they are left out, as `dpc prepare` does")
         if len(seen) == 0:
-            if not self.empty:
-                log.warn(
-                    f"before frame {number} came one without points: such frames are left out and have no number, as in what"
-                    " `dpc prepare` writes; reported once"
-                )
-            self.empty += 1
-            return seen
-        if number < self._window:
-            self._first.append(seen)
-            if number + 1 == self._window:
-                self._compare(self._first)
-                self._first = []
-        if len(seen) < _SPARSE and not self._few:
-            if not self.sparse:
-                log.warn(f"frame {number} has {counted(len(seen), 'point')}, repeated to fill a clip; reported once")
-            self.sparse += 1
+            what = f"before frame {number} came one without points"
+            self._count(_EMPTY, f"{what}: such frames are left out and have no number, as in what `dpc prepare` writes")
+        elif len(seen) < _SPARSE and not self._few:
+            self._count(_THIN, f"frame {number} has {counted(len(seen), 'point')}, repeated to fill a clip")
         return seen
 
+    def _count(self, kind: str, message: str) -> None:
+        """Counts an irregular frame, and warns of the first of its kind."""
+        if not self.counts[kind]:
+            log.warn(f"{message}; reported once")
+        self.counts[kind] += 1
+
     def sum_up(self) -> None:
-        """Logs how many irregular frames there were, where there was more than one."""
-        if self._first:  # fewer than a window
-            self._compare(self._first)
-        counts = {
-            "without points, left out": self.empty,
-            "with points at the origin, left out": self.padded,
-            f"of fewer than {_SPARSE} points": self.sparse,
-            "after a silence": self.gaps,
-        }
-        if any(count > 1 for count in counts.values()):
-            log.warn("frames in all: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count))
+        """Logs how many irregular frames there were, where there was more than one of a kind."""
+        if any(count > 1 for count in self.counts.values()):
+            log.warn("frames in all: " + ", ".join(f"{count} {kind}" for kind, count in self.counts.items() if count))
 
 
 def _nothing_seen(source: str, empty: int) -> DataError:

@@ -41,10 +41,9 @@ from dpcli.classify.data.videos import report_backward, report_gaps, report_shor
 from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
-from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import TrainingSettings, about_unread, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
-from dpcli.classify.training.fine_tune import resolved, settings_from
+from dpcli.classify.training.fine_tune import resolved, settings_from, settings_of_model
 from dpcli.classify.training.first_weights import take_weights
 from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
@@ -52,6 +51,7 @@ from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
 from dpcli.runtime.distributed import Processes, from_environment, process_group
@@ -108,26 +108,32 @@ def train(
     processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
     for data that can't be learned from.
     """
-    _refuse_wrong(given)
+    start = _model_that_chooses(given)
+    _refuse_wrong(given, start)
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
     with input_file(data) as path, process_group(chosen) as processes:
-        settings = _chosen_settings(given, CloudsReader(path))
+        settings = _chosen_settings(given, start, CloudsReader(path))
         for sentence in about_unread(settings, {**given.sets, **given.flags}):
             log.warn(sentence)
         settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
 
 
-def _refuse_wrong(given: Given) -> None:
+def _model_that_chooses(given: Given) -> ModelInfo | None:
+    """Returns the model to go on from where the preset is `auto`: network and timing are then that model's."""
+    values = given.values
+    if given.preset != AUTO or not values.get("init"):
+        return None
+    return load_model(find_model(values["init"], "--init"), values.get("backbone"))[1]
+
+
+def _refuse_wrong(given: Given, start: ModelInfo | None) -> None:
     """Raises UsageError for settings that are wrong whatever the file holds, before it is read: with the preset `auto` those
     that fit neither network among which the file chooses, or not the one to go on from."""
-    if given.preset == AUTO and given.values.get("init"):
-        _, info = load_model(find_model(given.values["init"], "--init"), given.values.get("backbone"))
-        preset = PRESETS["sparse" if info.timing == "slots" else "quick"]
-        run = replace(preset["run"], timing=info.timing)
-        training_settings(_without_part(given), {**preset, "network": info.config, "run": run})
+    if start is not None:
+        training_settings(replace(given, preset="quick"), settings_of_model(start))
         return
     problems = []
     for preset in ("quick", "sparse") if given.preset == AUTO else (given.preset,):
@@ -139,23 +145,14 @@ def _refuse_wrong(given: Given) -> None:
     raise problems[0]
 
 
-def _without_part(given: Given) -> Given:
-    """Returns what was given but for which part of a model learns, which is in the settings that go on from it."""
-    sets, flags = (
-        {name: value for name, value in own.items() if name != "fine_tune"} for own in (given.sets, given.flags)
-    )
-    return Given("quick", given.config, sets, flags)
-
-
-def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
+def _chosen_settings(given: Given, start: ModelInfo | None, reader: CloudsReader) -> TrainingSettings:
     """Returns the settings, with what the data choose where a person left it to them."""
-    if given.preset == AUTO and given.values.get("init"):
-        values = given.values
-        _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
-        base = settings_from(info, reader, values.get("fine_tune"))
-        return training_settings(_without_part(given), base)
-    preset = preset_for(reader, given.values) if given.preset == AUTO else given.preset
-    settings = training_settings(replace(given, preset=preset))
+    preset, base = given.preset, None
+    if start is not None:
+        preset, base = "quick", settings_from(start, reader, given.values.get("fine_tune"))
+    elif given.preset == AUTO:
+        preset = preset_for(reader, given.values)
+    settings = training_settings(replace(given, preset=preset), base)
     if given.preset == AUTO and preset == "long":
         log.info(
             f"preset long: the median video has {counted(int(np.median(reader.frame_counts)), 'frame')}, four clips of"
@@ -180,7 +177,7 @@ def _train(
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
     sources = [source for source in (videos.training, videos.validation) if source is not None]
     for source in sources:
-        report_short(source, settings.network.num_frames)
+        report_short(source)
     looked_at = sorted({i for source in sources for i in source.sequences})
     report_backward(videos.training.reader, looked_at)
     report_gaps(videos.training.reader, looked_at)
@@ -257,9 +254,10 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     """Returns the settings with the file's classes and rule of validation, and its clips. Raises DataError where nothing can
     be learned."""
     reader = CloudsReader(path)
-    if not class_table(reader):
+    names = class_table(reader)
+    if not names:
         raise DataError(f"{path}: no video has a label; prepare it with --labels or --label-from-folder")
-    settings = with_classes(settings, len(class_table(reader)))
+    settings = with_classes(settings, len(names))
     run = settings.run
     rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation
     settings = replace(settings, run=replace(run, validation=rule))
@@ -275,29 +273,28 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
         log.warn(f"{path}: {others}")
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
-    tell_mixed_rates(reader, training, run.timing)
+    tell_mixed_rates(reader, training, looks, run.timing)
     if settings.network.normalize not in ANY_UNIT:
         tell_mixed_sizes(reader, sorted({*training, *validation}))
     left_out: dict[str, str] = {}
     if run.timing == "slots" and not settings.network.scales:
         network, left_out = measured(settings.network, reader, training)
         settings = replace(settings, network=network)
-    options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
-    if rule == CROSS:
-        options["folds"] = cross_folds(reader, training, settings.network.members, seed)
-    tell_copies(reader, [*_judgments(training, validation, options.get("folds", {})), (training, _tests(reader))])
+    folds = cross_folds(reader, training, settings.network.members, seed) if rule == CROSS else {}
+    tell_copies(reader, [*_judgments(training, validation, folds), (training, _tests(reader))])
+    options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed, "folds": folds}
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
     remarks = (
-        about_classes(reader, options.get("folds", {})),
+        about_classes(reader, folds),
         about_absent_classes(reader, training, validation),
         about_people(reader, training, validation),
     )
     caveat = "; ".join(filter(None, remarks))
     digest = provenance.file_digest(path)
     lasting = lasting_rule(reader, rule, validation)
-    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out, lasting)
+    return settings, _Videos(source, held, counts, names, digest, caveat, looks, left_out, lasting)
 
 
 def _tests(reader: CloudsReader) -> list[int]:
@@ -353,11 +350,10 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
             " at least two classes are needed"
             + (f" (--validation {rule} holds out all videos of the others: give another)" if others else "")
         )
-    judged = {int(reader.labels[i]) for i in validation} | set(np.unique(reader.labels[reader.labels >= 0]).tolist())
-    missing = [names[label] for label in sorted(judged - seen)]
+    missing = [names[label] for label in sorted(set(reader.labels[reader.labels >= 0].tolist()) - seen)]
     if missing:
         log.warn(
-            f"{len(missing)} of {counted(len(names), 'class')} without a training video, so never recognized: {', '.join(missing[:8])}"
+            f"{len(missing)} of {counted(len(names), 'class')} without a training video, so never recognized: {first_names(missing, 8)}"
         )
 
 
@@ -366,9 +362,8 @@ def _tell_unlabeled(reader: CloudsReader, splits: tuple[str, ...]) -> None:
     for own in splits:
         names = [name for name, of, label in zip(reader.names, reader.splits, reader.labels) if of == own and label < 0]
         if names:
-            shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
             log.warn(
-                f"{reader.path}: {counted(len(names), 'video')} of the split {own!r} without a label, left out: {shown}"
+                f"{reader.path}: {counted(len(names), 'video')} of the split {own!r} without a label, left out: {first_names(names)}"
             )
 
 

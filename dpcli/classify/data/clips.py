@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -64,22 +65,57 @@ def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, .
 
 
 class OneVideo:
-    """Holds one sequence of a `clouds` file, with its number there, as a reader that knows no other."""
+    """Holds one video that is no file, or of a stream its last `size` frames, and gives them by number as a reader does.
 
-    def __init__(self, number: int, sequence: CloudSequence) -> None:
-        self.path, self.names = sequence.name, {number: sequence.name}
-        self.frame_counts = {number: sequence.num_frames}
-        self.fields = tuple(sequence.extra)
-        self._sequence = sequence
+    fields: the names of the kept columns that follow x, y and z in each frame.
+    """
 
-    def read(self, number: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
-        """Returns some frames of the sequence, with the columns among `fields`."""
-        own = self._sequence
-        found = CloudSequence.from_frames(own.name, [own.frame(t) for t in frames])
-        for name in fields:
-            shown = [own.extra[name][own.frame_offsets[t] : own.frame_offsets[t + 1]] for t in frames]
-            found.extra[name] = np.concatenate(shown)
+    def __init__(self, name: str, fields: Sequence[str] = (), size: int | None = None) -> None:
+        self.path, self.names, self.fields, self.size = name, (name,), tuple(fields), size
+        self._frames: deque[np.ndarray] = deque(maxlen=size)
+        self.count = 0  # frames so far
+
+    @classmethod
+    def of(cls, sequence: CloudSequence) -> OneVideo:
+        """Returns a sequence as such a video, with all of its kept columns."""
+        video = cls(sequence.name, tuple(sequence.extra))
+        for frame in frames_with_columns(sequence, video.fields):
+            video.append(frame)
+        return video
+
+    def append(self, points: np.ndarray) -> None:
+        """Takes the next frame, f32 (P,3+F) with the video's columns; the oldest one leaves where there are `size`."""
+        self._frames.append(points)
+        self.count += 1
+
+    @property
+    def frames(self) -> list[np.ndarray]:
+        """Returns the frames that are held, the oldest first."""
+        return list(self._frames)
+
+    @property
+    def first(self) -> int:
+        """Returns the number of the oldest frame that is held."""
+        return self.count - len(self._frames)
+
+    @property
+    def frame_counts(self) -> list[int]:
+        """Returns the number of frames of each video, as a reader does: of this one video, those so far."""
+        return [self.count]
+
+    def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
+        """Returns frames by their number in the video, with all columns; they must still be held."""
+        shown = [self._frames[t - self.first] for t in frames]
+        found = CloudSequence.from_frames(self.names[sequence], [frame[:, :3] for frame in shown])
+        for place, name in enumerate(self.fields, 3):
+            found.extra[name] = np.concatenate([frame[:, place] for frame in shown])
         return found
+
+
+def frames_with_columns(sequence: CloudSequence, fields: Sequence[str]) -> list[np.ndarray]:
+    """Returns the frames f32 (P,3+F) of a sequence, x, y and z with the kept columns of these names."""
+    rows = np.column_stack([sequence.points, *(sequence.extra[name] for name in fields)])
+    return [rows[start:end] for start, end in zip(sequence.frame_offsets, sequence.frame_offsets[1:])]
 
 
 class ClipSource:
@@ -127,7 +163,7 @@ class ClipSource:
         """Returns the clips of one video: every start, or `count`."""
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "slots":
-            return [Clip(sequence, shown) for shown in _looks(length, count or _LOOKS)]
+            return [Clip(sequence, shown) for shown in _looks(length, count or LOOKS)]
         if self.timing == "uniform":
             return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
@@ -208,8 +244,7 @@ class ClipSource:
         whole = len(clip.frames) == length and clip.frames == tuple(range(length))
         rows = self._rows.get(number) if whole else None
         if rows is None:
-            fields = tuple(map(kept_name, config.columns))
-            rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
+            rows = slot_rows(self.reader.read(number, clip.frames, fields=config.column_fields), config)
             if whole and self.augmentation != NONE:
                 self._rows[number] = rows
         made = in_slots(changed_rows(rows, self.augmentation, config.signed_columns, rng), config, rng)
@@ -218,7 +253,7 @@ class ClipSource:
         return made
 
 
-_LOOKS = 4  # at a video in slots
+LOOKS = 4  # at a video in slots, at most
 _END = 0.08  # of its frames that a look leaves out at an end
 
 
@@ -234,9 +269,9 @@ def check_columns(reader: CloudsReader | OneVideo, config: KinetConfig) -> None:
     fields = getattr(reader, "fields", ())
     missing = [name for name in config.columns if kept_name(name) not in fields]
     if missing:
-        read = {*map(kept_name, config.columns)}
-        others = [name.removeprefix(KEPT) for name in fields if name.startswith(KEPT) and name not in read]
-        has = f" (the file has {', '.join(sorted(others))}: if one is the same by another name, call it so in the raw data)"
+        kept = [name for name in fields if name.startswith(KEPT) and name not in config.column_fields]
+        others = sorted(name.removeprefix(KEPT) for name in kept)
+        has = f" (the file has {', '.join(others)}: if one is the same by another name, call it so in the raw data)"
         raise DataError(
             f"{reader.path}: no column {', '.join(missing)}, which the network reads of every point; prepare the file with"
             f" --keep-fields {','.join(config.columns)}{has if others else ''}"

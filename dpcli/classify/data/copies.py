@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from dpcli.classify.data.validation_split import class_table
 from dpcli.counted import counted
 from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
@@ -56,12 +57,8 @@ def tell_copies(reader: CloudsReader, rounds: Sequence[tuple[Sequence[int], Sequ
         )
     mixed = [group for group in groups if len({int(reader.labels[i]) for i in group}) > 1]
     if mixed:
-        shown = [" = ".join(f"{names[i]} ({_class(reader, i)})" for i in group) for group in mixed]
+        classes = class_table(reader)
+        shown = [" = ".join(f"{names[i]} ({classes[reader.labels[i]]})" for i in group) for group in mixed]
         log.warn(
             f"{reader.path}: the same points under different labels, of which one must be wrong: {first_names(shown)}"
         )
-
-
-def _class(reader: CloudsReader, sequence: int) -> str:
-    label = int(reader.labels[sequence])
-    return reader.class_names[label] if reader.class_names else str(label)

@@ -128,11 +128,13 @@ def tell_rate(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
         _tell_rate(reader, sequences, usual, f"in what {model} learned from")
 
 
-def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], timing: str) -> None:
-    """Warns where some training videos have another frame rate than most, of which clips of consecutive frames know nothing."""
-    intervals = list(_intervals(reader, sequences).values()) if timing == "clips" else []
-    if intervals:
-        _tell_rate(reader, sequences, float(np.median(intervals)), "in the median video")
+def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], looks: dict[str, float], timing: str) -> None:
+    """Warns where some training videos have another frame rate than most, of which clips of consecutive frames know nothing.
+
+    looks: `file_like` of them.
+    """
+    if timing == "clips" and "interval" in looks:
+        _tell_rate(reader, sequences, looks["interval"], "in the median video")
 
 
 def _tell_rate(reader: CloudsReader, sequences: Sequence[int], usual: float, where: str) -> None:

@@ -54,17 +54,14 @@ def measured(config: KinetConfig, reader: CloudsReader, sequences: list[int]) ->
     columns are not read."""
     columns, left_out = telling_columns(reader, sequences)
     config = config.changed(columns=columns, scales=measured_scales(reader, sequences, columns))
-    counts = [(len(one.points), len(slot_rows(one, config))) for one in (_read(reader, i, config) for i in sequences)]
+    videos = (reader.read(i, fields=config.column_fields) for i in sequences)
+    counts = [(len(one.points), len(slot_rows(one, config))) for one in videos]
     points, near = np.sum(counts, 0)
     log.info(
         f"sparse clouds: points farther than {FARTHEST * config.scales[0]:.3g} from their video's median are left out"
         f" ({points - near} of {points}); read beside places: {', '.join(columns) or 'nothing'}{not_read(left_out)}"
     )
     return config, left_out
-
-
-def _read(reader: CloudsReader, sequence: int, config: KinetConfig) -> CloudSequence:
-    return reader.read(sequence, fields=tuple(map(kept_name, config.columns)))
 
 
 def measured_scales(reader: CloudsReader, sequences: list[int], columns: tuple[str, ...]) -> tuple[float, ...]:

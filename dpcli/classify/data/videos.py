@@ -135,8 +135,9 @@ def report_gaps(reader: CloudsReader, sequences: Sequence[int]) -> None:
         )
 
 
-def report_short(source: ClipSource, frames: int) -> None:
+def report_short(source: ClipSource) -> None:
     """Names the videos that are dropped or padded, and those with frames without points, with a message each."""
+    frames = source.config.num_frames
     longer = "each frame shown several times" if source.timing == "uniform" else "padded by holding the last frame"
     for names, what in ((source.dropped, "dropped"), (source.padded, longer)):
         if names:

@@ -9,9 +9,23 @@ from typing import Literal
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.fields import WIDEST, check, setting
 from dpcli.runtime.settings.stored import from_json
+from dpcli.store.schema import kept_name
 
 CROSS = "cross"  # the rule of validation by which every video is judged by members that never saw it
 
+# what the published code does: groups of 3 features, a group of raw coordinates, absolute time, weights by projection, a merge
+# across scales, averaged logits
+RELEASE = {
+    "variant": "release",
+    "group_size": 3,
+    "xyz_group": True,
+    "time_input": True,
+    "weighting": "projection",
+    "merge": "cross",
+    "guard": "release",
+    "fusion": "logits",
+    "grouping": "first",
+}
 _MOST_POINTS = 1 << 22  # of a clip: 85 times those of the thesis
 
 
@@ -159,6 +173,11 @@ class KinetConfig:
         self._check_reach("static_temporal_radius", self.static_radius)
 
     @property
+    def column_fields(self) -> tuple[str, ...]:
+        """Returns the names of the columns as fields of a clouds file."""
+        return tuple(map(kept_name, self.columns))
+
+    @property
     def signed_columns(self) -> list[int]:
         """Returns the places of the columns that are speeds: their middle is 0."""
         return [place for place, middle in enumerate(self.scales[1::2]) if middle == 0]
@@ -211,20 +230,8 @@ class KinetConfig:
 
     @classmethod
     def release(cls, **changes: object) -> KinetConfig:
-        """Returns the published code's choices, with changes over them: groups of 3 features, a group of raw coordinates, absolute
-        time, weights by projection, a merge across scales, averaged logits."""
-        choices = {
-            "variant": "release",
-            "group_size": 3,
-            "xyz_group": True,
-            "time_input": True,
-            "weighting": "projection",
-            "merge": "cross",
-            "guard": "release",
-            "fusion": "logits",
-            "grouping": "first",
-        }
-        return cls(**{**choices, **changes})
+        """Returns the published code's choices, `RELEASE`, with changes over them."""
+        return cls(**{**RELEASE, **changes})
 
     def changed(self, **changes: object) -> KinetConfig:
         """Returns a copy with some fields changed. Raises UsageError where they don't fit."""

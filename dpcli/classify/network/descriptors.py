@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 SLOTS = 6  # parts of a video, equally long
-_LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)
+LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)  # of the quantiles that are taken
 
 
 def clip_descriptors(clips: np.ndarray) -> np.ndarray:
@@ -23,9 +23,9 @@ def clip_descriptors(clips: np.ndarray) -> np.ndarray:
 
 def described(values: np.ndarray, slot: np.ndarray) -> np.ndarray:
     """Returns what the points' values f64 (N,C) are like in all and in each slot, i (N): shares, quantiles, shifts."""
-    whole = np.quantile(values, _LEVELS, axis=0)
+    whole = np.quantile(values, LEVELS, axis=0)
     slots = _slots(values, slot, whole)
-    middles = slots[:, len(_LEVELS) // 2]
+    middles = slots[:, len(LEVELS) // 2]
     counts = np.bincount(slot, minlength=SLOTS) / max(len(slot), 1)
     return np.concatenate([counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
 
@@ -35,5 +35,5 @@ def _slots(values: np.ndarray, slot: np.ndarray, whole: np.ndarray) -> np.ndarra
     found = [whole]
     for number in range(SLOTS):
         own = values[slot == number]
-        found.append(np.quantile(own, _LEVELS, axis=0) if len(own) else found[-1])
+        found.append(np.quantile(own, LEVELS, axis=0) if len(own) else found[-1])
     return np.stack(found[1:])

@@ -24,6 +24,11 @@ class ModelInfo:
     timing: str = "clips"
     notes: dict = field(default_factory=dict)
 
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Returns the names of the streams that were trained."""
+        return tuple(self.notes.get("streams", STREAMS))
+
 
 _FORMAT, _MAKER = "dpc-kinet-1", "dpc classify train"
 SHIPPED = Path(__file__).parents[1] / "weights"

@@ -42,16 +42,14 @@ class LivePage:
     def __init__(self, path: Path, title: str, class_names: Sequence[str], how: Cutting, command: str) -> None:
         self.path, self.title, self.class_names, self.how, self.command = path, title, list(class_names), how, command
         self._frames, self._made = Thinned(_MOST_FRAMES), Thinned(_MOST_PREDICTIONS)
-        self._seen, self._gaps = 0, 0
 
     def see(self, points: np.ndarray, silent: float) -> None:
         """Takes a frame f32 (P,3) before it is predicted; silent: seconds since the one before."""
-        if self._seen % self._frames.every == 0:
-            keep = generator(0, self._seen).permutation(len(points))[:_MOST_POINTS]
-            self._frames.add((self._seen, points[keep] @ _CAMERA.T))
-        else:
-            self._frames.add(None)
-        self._seen += 1
+        number, shown = self._frames.count, None
+        if number % self._frames.every == 0:
+            keep = generator(0, number).permutation(len(points))[:_MOST_POINTS]
+            shown = (number, points[keep] @ _CAMERA.T)
+        self._frames.add(shown)
 
     def write(self, made: Prediction, latency: float, waiting: int) -> None:
         """Takes a prediction; latency in seconds."""

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.classify.confidence import Confidence, log_probabilities
+from dpcli.classify.data.clips import frames_with_columns
 from dpcli.classify.segments.decoding import best_path, runs
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.schema import kept_name
 from dpcli.store.tables.segments import Segment
 
 _CHANGE = 0.3  # what a change of class costs, in windows of full certainty; docs/experiments/classify.md, 2026-11-28
@@ -47,10 +47,9 @@ def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: in
     """Returns what the windows of a recording say; some hundred frames are in memory at a time."""
     made: list[Prediction | None] = []
     times = []
-    columns = tuple(map(kept_name, predictor.info.config.columns))
+    columns = predictor.info.config.column_fields
     for block in _blocks(reader, sequence, columns):
-        points = np.column_stack([block.points, *(block.extra[name] for name in columns)])
-        made += [predictor.add(frame) for frame in np.split(points, block.frame_offsets[1:-1])]
+        made += [predictor.add(frame) for frame in frames_with_columns(block, columns)]
         times.append(block.time)
         bar.advance(block.num_frames)
     made.append(predictor.finish())

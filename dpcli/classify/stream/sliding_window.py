@@ -2,57 +2,19 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from dpcli.classify.data.clips import Clip, ClipSource, clip_frames, uniform_frames
+from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, clip_frames, uniform_frames
 from dpcli.classify.data.likeness import NOTE
-from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.video_scores import clip_scores
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.runtime.seeds import generator
-from dpcli.store import CloudSequence
-from dpcli.store.schema import kept_name
-
-
-class Window:
-    """Holds the last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
-
-    names, path = ("stream",), Path("stream")
-
-    def __init__(self, size: int, columns: tuple[str, ...] = ()) -> None:
-        self.size, self.fields = size, tuple(map(kept_name, columns))
-        self._frames: deque[np.ndarray] = deque(maxlen=size)
-        self.count = 0  # frames so far
-
-    def append(self, points: np.ndarray) -> None:
-        """Takes the next frame, f32 (P,3+F) with the window's columns; the oldest one leaves."""
-        self._frames.append(points)
-        self.count += 1
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    @property
-    def frame_counts(self) -> list[int]:
-        """Returns the number of frames of each video, as a reader does: of this one video, those seen so far."""
-        return [self.count]
-
-    def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
-        """Returns frames by their number in the stream; they must still be in the window."""
-        first = self.count - len(self._frames)
-        shown = [self._frames[t - first] for t in frames]
-        found = CloudSequence.from_frames(self.names[sequence], [frame[:, :3] for frame in shown])
-        for place, name in enumerate(self.fields, 3):
-            found.extra[name] = np.concatenate([frame[:, place] for frame in shown])
-        return found
 
 
 @dataclass(frozen=True)
@@ -120,9 +82,9 @@ class StreamPredictor:
         if hop < 1:
             raise UsageError(f"--hop {hop}: expected at least 1 frame")
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
-        self.window = Window(window_size(info, window), info.config.columns)
+        self.window = OneVideo("stream", info.config.column_fields, window_size(info, window))
         self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
-        self.streams = tuple(info.notes.get("streams", STREAMS))
+        self.streams = info.streams
         self.clips = 0
         self._sum = np.zeros((1 + len(self.streams), info.config.num_classes))
 
@@ -151,7 +113,7 @@ class StreamPredictor:
     def clip(self) -> Clip:
         """Returns the clip that ends at the newest frame, by frame numbers."""
         count, frames = self.window.count, self.info.config.num_frames
-        first = count - len(self.window)
+        first = self.window.first
         if self.info.timing == "slots":
             return Clip(0, tuple(range(first, count)))
         if self.info.timing == "uniform":

@@ -39,19 +39,24 @@ def part_for(reader: CloudsReader) -> str:
     return "probe" if videos <= _PROBE else "head" if videos <= _HEAD else "all"
 
 
+def settings_of_model(info: ModelInfo) -> dict[str, Any]:
+    """Returns the groups of settings, as a preset has them, that a run from a model begins with: its network and its timing."""
+    base = PRESETS["sparse" if info.timing == "slots" else "quick"]
+    return {**base, "network": info.config, "run": replace(base["run"], timing=info.timing)}
+
+
 def settings_from(info: ModelInfo, reader: CloudsReader, part: str | None) -> dict[str, Any]:
-    """Returns the groups of settings, as a preset has them, of a run that goes on from a model: its network and timing, the
-    part that learns (chosen by the data for `auto` and None), and as many epochs as the data need.
+    """Returns `settings_of_model` fitted to a file: the part that learns (chosen by the data for `auto` and None), and as many
+    epochs as the data need.
 
     Raises DataError where no training video has a label.
     """
-    base = PRESETS["sparse" if info.timing == "slots" else "quick"]
+    base = settings_of_model(info)
     chosen = part_for(reader) if part in (None, "auto") else part
     return {
         **base,
         "network": _in_its_unit(info.config, reader).changed(forest=(0, 0)),
         "schedule": _schedule(base["schedule"], chosen, len(labeled(reader, "train"))),
-        "run": replace(base["run"], timing=info.timing),
     }
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from dpcli.errors import UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
 
 _CLASSIFIER = "classify"  # in the name of a layer whose rows are classes
 _GROWN = "forest"  # in the name of what no training goes on from: forests are grown at its end
-_NAMED = 5  # classes or tensors in a message
 
 
 def take_weights(
@@ -73,15 +73,13 @@ def _told(missing: list[str], known: list[str], classes: int, forests: bool) -> 
     parts = ["weights taken"]
     if len(known) < classes:
         knows = (
-            f"{len(known)} of {classes} classes by name ({_some(known)})" if known else f"none of the {classes} classes"
+            f"{len(known)} of {classes} classes by name ({first_names(known)})"
+            if known
+            else f"none of the {classes} classes"
         )
         parts.append(f"it knows {knows}, so the last layers learn {'the others' if known else 'them'} from nothing")
     if forests:
         parts.append("forests are grown anew at the end")
     if missing:
-        parts.append(f"from nothing: {_some(missing)}")
+        parts.append(f"from nothing: {first_names(missing)}")
     return parts
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

@@ -2,8 +2,7 @@
 
 Thesis section 3.4.2.3 and A.1.3. A run can be stopped at any step and continued to the same result: every clip's
 randomness comes from (seed, epoch, position), what a step drops from (seed, stage, epoch, step), and the state holds weights,
-optimizer and the step. Several processes
-(torchrun) share each batch and take the steps that one process would take.
+optimizer and the step. Several processes (torchrun) share each batch and take the steps that one process would take.
 """
 
 from __future__ import annotations
@@ -29,6 +28,15 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import torch_seed
 from dpcli.runtime.signals import StopRequest
+
+_KEPT = (
+    "stage",
+    "epoch",
+    "step",
+    "best",
+    "sums",
+    "spent",
+)  # what a state holds of a trainer beside weights and optimizer
 
 
 class Trainer:
@@ -228,12 +236,7 @@ class Trainer:
         if self.processes.first:
             self.folder.save_state(
                 {
-                    "stage": self.stage,
-                    "epoch": self.epoch,
-                    "step": self.step,
-                    "best": self.best,
-                    "sums": self.sums,
-                    "spent": self.spent,
+                    **{key: getattr(self, key) for key in _KEPT},
                     "model": self.model.state_dict(),
                     "optimizer": self.optimize.optimizer.state_dict() if self.optimize is not None else None,
                 }
@@ -242,7 +245,7 @@ class Trainer:
             self.processes.wait()
 
     def _restore(self, state: dict) -> None:
-        for key in ("stage", "epoch", "step", "best", "sums", "spent"):
+        for key in _KEPT:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         if self.stage < 2 and state["optimizer"] is not None:

@@ -64,6 +64,11 @@ def test_a_radar_gets_its_own_network_which_learns_and_predicts(tmp_path, capsys
     assert (scores.scores.argmax(1) == scores.labels).all() and np.allclose(scores.scores.sum(1), 1, atol=1e-5)
     again = tmp_path / "again.h5"
     assert dpc("classify", "predict", data, "--model", tmp_path / "run", "-o", again, "--batch", 1) == 0
+    assert "--clips-per-video" not in capsys.readouterr().err
+    assert np.array_equal(scores.scores, ScoresReader(again).scores)
+    words = ("-o", again, "--force", "--clips-per-video", 9)
+    assert dpc("classify", "predict", data, "--model", tmp_path / "run", *words) == 0
+    assert "whose clips are whole videos; 4 of each are taken" in capsys.readouterr().err
     assert np.array_equal(scores.scores, ScoresReader(again).scores)
     bare = radar(tmp_path / "bare.h5", 2, column=False)
     capsys.readouterr()
@@ -145,7 +150,7 @@ def test_an_hour_is_one_clip_with_a_warning(tmp_path, capsys):
     times = 54_000 // video.num_frames + 1
     hour = CloudSequence.from_frames("hour", [video.frame(t) for t in range(video.num_frames)] * times)
     hour.extra = {SPEED: np.tile(video.extra[SPEED], times)}
-    source = ClipSource(OneVideo(0, hour), [0], config, timing="slots")
+    source = ClipSource(OneVideo.of(hour), [0], config, timing="slots")
     clips = source.video_clips(0, None)
     assert len(clips) == 4 and source.load(clips[0], 0).shape == (16, 24, 6)
     with CloudsWriter(tmp_path / "hour.h5", class_names=["up", "down"], fields=[SPEED]) as writer:

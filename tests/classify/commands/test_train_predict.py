@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +20,13 @@ from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.data.videos import held_out
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import ModelInfo, load_model
+from dpcli.classify.training.trainer import Trainer
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from tests.support.commands import exit_code, piped
 
 ROOT = Path(__file__).resolve().parents[3]
-TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "0.34")
+TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "2", "--seed", "3", "--validation", "0.34")
 
 
 def gestures(path: Path, videos: int = 12, frames: int = 6) -> Path:
@@ -141,19 +142,28 @@ def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_fo
 
 
 ENDS_EARLY = """
-import os, signal, sys
-from dpcli.classify.commands import predict as commands
+import sys
 from dpcli.cli.app import main
-number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.ScoreVideo.__call__
-scored = []
-def ending(work, numbered):
-    scored.append(numbered[0])
-    if len(scored) == after + 1:
-        os.kill(os.getpid(), number)
-    return whole(work, numbered)
-commands.ScoreVideo.__call__ = ending
+from tests.classify.commands.test_train_predict import end_early
+end_early(*map(int, (sys.argv.pop(1), sys.argv.pop(1))))
 main()
 """
+
+
+def end_early(number: int, after: int, replace: Callable = setattr) -> None:
+    """Has this process send itself a signal once so many videos are scored or steps taken, or lack memory where that is 0."""
+    for work, step in ((predict.ScoreVideo, "__call__"), (Trainer, "_take")):
+        whole, done = getattr(work, step), []
+
+        def ending(*words, whole=whole, done=done):
+            done.append(None)
+            if len(done) == after + 1 and not number:
+                raise MemoryError
+            if len(done) == after + 1:
+                os.kill(os.getpid(), number)
+            return whole(*words)
+
+        replace(work, step, ending)
 
 
 @pytest.fixture(scope="module")
@@ -165,23 +175,13 @@ def whole_scores(data, run_folder) -> Path:
 
 
 def ending_early(number: int, after: int, dpc_here, words: list) -> subprocess.CompletedProcess:
-    """A prediction that sends itself a signal once so many videos are scored, or lacks memory where that is 0."""
+    """A command that `end_early` ends; by SIGKILL, in a process of its own."""
     if number == signal.SIGKILL:
         command = [sys.executable, "-c", ENDS_EARLY, int(number), after, *words]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         return subprocess.run([str(word) for word in command], capture_output=True, env=environment)
-    score, scored = predict.ScoreVideo.__call__, []
-
-    def ending(work, numbered):
-        scored.append(numbered[0])
-        if len(scored) == after + 1 and not number:
-            raise MemoryError
-        if len(scored) == after + 1:
-            os.kill(os.getpid(), number)
-        return score(work, numbered)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predict.ScoreVideo, "__call__", ending)
+        end_early(number, after, patch.setattr)
         return dpc_here(*words)
 
 
@@ -197,7 +197,7 @@ def test_a_stopped_and_a_killed_prediction_go_on(
         assert b"4 of 12 videos are kept; run the same command again to continue" in first.stderr
     score, scored = predict.ScoreVideo.__call__, []
     monkeypatch.setattr(
-        predict.ScoreVideo, "__call__", lambda work, numbered: scored.append(numbered[0]) or score(work, numbered)
+        predict.ScoreVideo, "__call__", lambda work, video: scored.append(video.name) or score(work, video)
     )
     second = dpc_here(*words, "--batch=2")
     assert second.returncode == 0 and len(scored) == 12 - kept
@@ -281,7 +281,6 @@ def last_weights(folder: Path) -> dict:
 
 def test_a_stopped_step_drops_what_it_would_have_dropped(data, tmp_path, monkeypatch):
     """Dropout's masks come from the step, not from how often the run was begun; stopped in both stages and after an epoch."""
-    from dpcli.classify.training.trainer import Trainer
 
     def run(name, *stops):
         for stop in (*stops, None):
@@ -344,36 +343,22 @@ def test_weights_of_another_model_are_told(data, run_folder, dpc_here, tmp_path)
 def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc_here, tmp_path):
     """SIGTERM in the middle of an epoch saves the step and exits 75; kill -9 loses at most the epoch in hand."""
     folder = tmp_path / "run"
-    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", "2", "--set", "epochs_dynamic=2")
-    command = [sys.executable, "-m", "dpcli", *map(str, words)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    first = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment)
-    wait_for(folder / "state.pt", first)
-    first.send_signal(signal.SIGTERM)
-    message = first.communicate(timeout=120)[1].decode()
-    if first.returncode != 0:  # 0: it was done before the signal came
-        assert first.returncode == 75 and "run the same command again" in message
-    second = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
-    time.sleep(4)
-    second.kill()
-    second.wait()
+    words = ["classify", "train", data, "-o", folder, *TRAIN, "--epochs", "2", "--set", "epochs_dynamic=2"]
+    first = ending_early(signal.SIGTERM, 4, dpc_here, words)  # 3 steps an epoch, 2 epochs a stage
+    assert first.returncode == 75 and b"saved at epoch 2, step 2; run the same command again" in first.stderr
+    second = ending_early(signal.SIGKILL, 5, dpc_here, words)
+    assert second.returncode == -signal.SIGKILL and b"stage 1 of 2, epoch 2" in second.stderr
     third = dpc_here(*words)
-    assert third.returncode == 0, third.stderr.decode()
+    assert third.returncode == 0 and b"stage 2 of 2, epoch 2" in third.stderr, third.stderr.decode()
     ours, whole = last_weights(folder), last_weights(run_folder)
     # The same steps in the same order, to rounding: after a first compilation weights were 5e-7 of their norm apart (cause unknown), and
-    # Adam amplifies the last bit where a gradient is nearly zero. A lost step or optimizer state moves weights by far more.
+    # Adam amplifies the last bit where a gradient is nearly zero. A lost optimizer state moves them by 0.017, a lost step by more.
     learned = [key for key in whole if whole[key].dim() > 1]
     apart = sum(float((ours[key] - whole[key]).square().sum()) for key in learned) ** 0.5
     size = sum(float(whole[key].square().sum()) for key in learned) ** 0.5
-    assert apart < 0.03 * size, apart / size
+    assert apart < 0.005 * size, apart / size
     rows = [json.loads((where / "log.json").read_text()) for where in (folder, run_folder)]
     assert [(r["stage"], r["epoch"]) for r in rows[0]] == [(r["stage"], r["epoch"]) for r in rows[1]]
-
-
-def wait_for(path: Path, process: subprocess.Popen) -> None:
-    deadline = time.monotonic() + 240
-    while not path.exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
 
 
 def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc_here):
@@ -415,21 +400,21 @@ def test_videos_of_four_clips_are_judged_as_a_whole_unless_a_preset_is_named(dat
         "--set",
         "neighbors=8",
         "--epochs",
-        1,
+        0,
         "--set",
-        "epochs_dynamic=1",
+        "epochs_dynamic=0",
         "--validation",
         "none",
     )
     done = dpc_here("classify", "train", data, "-o", tmp_path / "auto", *small)
     assert done.returncode == 0, done.stderr.decode()
     assert (b"preset long: the median video has 6 frames, four clips of 1 or more" in done.stderr) == (preset == "long")
-    schedule = json.loads((tmp_path / "auto" / "config.json").read_text())["schedule"]
-    assert schedule["video_loss"] == (preset == "long") and schedule["clips_per_video"] == (
-        4 if preset == "long" else 1
-    )
     named = dpc_here("classify", "train", data, "-o", tmp_path / "quick", "--preset", "quick", *small)
     assert named.returncode == 0 and b"preset long" not in named.stderr
+    for run, used in (("auto", preset), ("quick", "quick")):
+        schedule = json.loads((tmp_path / run / "config.json").read_text())["schedule"]
+        assert schedule["video_loss"] == (used == "long")
+        assert schedule["clips_per_video"] == (4 if used == "long" else 1)
 
 
 def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):
@@ -559,12 +544,12 @@ def test_every_start_is_scored(data, run_folder, dpc_here, tmp_path):
 
     from dpcli.classify.data.clips import ClipSource
     from dpcli.classify.network.model_file import load_model
-    from dpcli.classify.video_scores import batches, predict_videos
+    from dpcli.classify.video_scores import batches, score_video
 
     model, info = load_model(str(run_folder))
     reader = CloudsReader(data)
     source = ClipSource(reader, [2], info.config)
-    video = next(predict_videos(model, source, None, 8, torch.device("cpu")))
+    video = score_video(model, source, 2, None, 8, torch.device("cpu"))
     assert video.clips == 3
     with torch.inference_mode():
         rows = [model(points)[0].softmax(-1) for _, points in batches(source, source.clips(None), 1)]

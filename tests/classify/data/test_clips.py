@@ -65,10 +65,10 @@ def test_frames_without_points_are_told_where_clips_show_them(tmp_path, capsys):
         ):
             writer.write(CloudSequence.from_frames(name, frames, label=0))
     empty = CloudsReader(tmp_path / "e.h5")
-    report_short(ClipSource(empty, [0, 1], CONFIG), 4)
+    report_short(ClipSource(empty, [0, 1], CONFIG))
     assert "2 frames without points in 1 video taken as points at the origin: gaps" in capsys.readouterr().err
-    report_short(ClipSource(empty, [0], CONFIG), 4)
-    report_short(ClipSource(empty, [0, 1], CONFIG.changed(scales=(1.0,)), timing="slots"), 4)
+    report_short(ClipSource(empty, [0], CONFIG))
+    report_short(ClipSource(empty, [0, 1], CONFIG.changed(scales=(1.0,)), timing="slots"))
     assert capsys.readouterr().err == ""
 
 
@@ -119,7 +119,7 @@ def test_short_videos_are_padded_or_dropped_and_named(reader):
 def test_what_becomes_of_a_short_video_is_told_as_it_is(reader, timing, shown, told, capsys):
     source = ClipSource(reader, [0], CONFIG, timing=timing)
     assert source.clips(1)[0].frames == shown
-    report_short(source, 4)
+    report_short(source)
     assert f"1 video of fewer than 4 frames, {told}" in " ".join(capsys.readouterr().err.split())
 
 

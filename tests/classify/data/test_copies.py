@@ -57,8 +57,10 @@ def test_copies_have_the_same_points_in_the_same_frames_whatever_their_names(tmp
     ],
 )
 def test_a_copy_that_judges_or_has_another_label_is_told(
-    command, split, label, person, judged, mixed, tmp_path, capsys
+    command, split, label, person, judged, mixed, tmp_path, capsys, monkeypatch
 ):
+    for forests in ("commands.baseline", "training.forests"):  # what they say is not looked at
+        monkeypatch.setattr(f"dpcli.classify.{forests}.TREES", 2)
     more = [("again", frames(0), label, split, person)] if split else []
     path = clouds(tmp_path / "c.h5", [*people(), *more])
     words = ["-o", tmp_path / "run", "--epochs", 0, "--set", "members=2"] if command == "train" else []

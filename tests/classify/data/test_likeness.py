@@ -170,7 +170,7 @@ def test_another_frame_rate_is_told_where_clips_are_consecutive_frames(rates, mo
             writer.write(sequence)
     reader = CloudsReader(tmp_path / "c.h5")
     if model is None:
-        tell_mixed_rates(reader, range(3), timing)
+        tell_mixed_rates(reader, range(3), file_like(reader, range(3)), timing)
     else:
         tell_rate(reader, range(3), ModelInfo(KinetConfig(), ["a"], timing), SHIPPED / f"{model}.safetensors")
     err = " ".join(capsys.readouterr().err.split())

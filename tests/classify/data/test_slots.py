@@ -346,13 +346,13 @@ def test_a_file_without_the_columns_is_refused(tmp_path):
     bare = video()
     bare.extra = {}
     with pytest.raises(DataError, match="no column speed.*--keep-fields speed$"):
-        ClipSource(OneVideo(0, bare), [0], config, timing="slots")
+        ClipSource(OneVideo.of(bare), [0], config, timing="slots")
     renamed = video()
     renamed.extra = {kept_name("Doppler"): renamed.extra[kept_name("speed")]}
     with pytest.raises(DataError, match=r"no column speed.*--keep-fields speed \(the file has Doppler: .*call it so"):
-        ClipSource(OneVideo(0, renamed), [0], config, timing="slots")
-    assert ClipSource(OneVideo(0, video()), [0], config, timing="slots").load(
-        ClipSource(OneVideo(0, video()), [0], config, timing="slots").video_clips(0, None)[0], 0
+        ClipSource(OneVideo.of(renamed), [0], config, timing="slots")
+    assert ClipSource(OneVideo.of(video()), [0], config, timing="slots").load(
+        ClipSource(OneVideo.of(video()), [0], config, timing="slots").video_clips(0, None)[0], 0
     ).shape == (4, 8, 6)
 
 

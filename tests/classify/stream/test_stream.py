@@ -24,15 +24,15 @@ from hypothesis import strategies as st
 
 from dpcli.classify.commands.stream import Speaker, _IrregularFrames
 from dpcli.classify.confidence import Confidence
-from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
+from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
 from dpcli.classify.stream import frame_source as stream_input
 from dpcli.classify.stream.frame_source import open_frames, read_arrays
 from dpcli.classify.stream.read_ahead import ReadAhead
-from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window, window_size
-from dpcli.classify.video_scores import batches, predict_videos
+from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, window_size
+from dpcli.classify.video_scores import batches, score_video
 from dpcli.cli.app import main
 from dpcli.cli.classify import predict as command
 from dpcli.cli.classify.predict_stream import cloud_files
@@ -116,7 +116,7 @@ def uniform_file(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("rule", ["center", "height", "unit", "image"])
 def test_a_window_gives_the_points_that_the_whole_file_gives(tmp_path, rule):
     """No rule of normalization may need frames that have left the window."""
-    frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), Window(4)
+    frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), OneVideo("stream", size=4)
     reader = batch_source(frames, tmp_path).reader
     for points in frames:
         window.append(points)
@@ -135,7 +135,7 @@ def test_every_prediction_equals_the_batch_one(tmp_path):
     theirs = [static_scores(model, source, clip) for clip in source.clips(None)]
     for prediction, scores in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(prediction.scores[1], scores)
-    video = next(predict_videos(model, source, None, 8, CPU))
+    video = score_video(model, source, 0, None, 8, CPU)
     np.testing.assert_allclose(ours[-1].mean, [video.fused, *video.streams.values()], atol=1e-5)
     assert video.clips == ours[-1].clips == 8
     assert np.ptp(theirs, axis=0).max() > 0.05, "clips must differ, or equality says nothing"
@@ -157,7 +157,7 @@ def test_a_hop_leaves_out_clips_and_changes_none():
 def test_a_stream_shorter_than_the_window_ends_as_batch_does(tmp_path, timing):
     frames = random_frames(3)
     (only,) = streamed(frames, timing, window=4)
-    video = next(predict_videos(untrained()[0], batch_source(frames, tmp_path, timing), None, 8, CPU))
+    video = score_video(untrained()[0], batch_source(frames, tmp_path, timing), 0, None, 8, CPU)
     assert only.frame == 2
     np.testing.assert_allclose(only.scores, [video.fused, *video.streams.values()], atol=1e-6)
 
@@ -180,7 +180,7 @@ def test_a_model_without_a_dynamic_stream_says_only_what_it_knows(tmp_path):
     info.notes["streams"] = ["static"]
     predictor = StreamPredictor(model, info, seed=5)
     *_, last = [predictor.add(frame) for frame in frames]
-    video = next(predict_videos(model, batch_source(frames, tmp_path), None, 8, CPU, ["static"]))
+    video = score_video(model, batch_source(frames, tmp_path), 0, None, 8, CPU, ["static"])
     np.testing.assert_allclose(last.mean, [video.fused, video.streams["static"]], atol=1e-5)
 
 
@@ -394,7 +394,7 @@ def test_the_command_prints_a_line_per_hop_and_writes_what_batch_writes(model_fi
     options = (tmp_path / "walk.npy", "--stream", "--model", model_file, "-o", tmp_path / "s.h5", "--seed", 5)
     assert run(*options, "--json") == 0
     *lines, last = rows(capsys.readouterr().out)
-    video = next(predict_videos(untrained()[0], source, None, 8, CPU))
+    video = score_video(untrained()[0], source, 0, None, 8, CPU)
     scores = ScoresReader(tmp_path / "s.h5")
     np.testing.assert_allclose(scores.scores[0], video.fused, atol=1e-5)
     np.testing.assert_allclose(scores.streams["dynamic"][0], video.streams["dynamic"], atol=1e-5)

@@ -181,11 +181,14 @@ def test_weights_to_start_from_that_changed_make_another_run(start, model, tmp_p
         train(str(data), str(tmp_path / "run"), given)
 
 
-def test_settings_are_held_against_the_model_s_network(model, tmp_path):
-    """Eight centroids are its own; as many as the preset quick has would not fit into 2 frames of 16 points."""
+def test_settings_are_held_against_the_model_s_network(model, tmp_path, capsys):
+    """Eight centroids are its own; as many as the preset quick has would not fit into 2 frames of 16 points. The data choose
+    what learns also where a file of settings leaves it to them."""
     data = clouds(tmp_path / "c.h5", 1, names=("wave", "bow"))
-    given = Given("auto", sets={"epochs_dynamic": 0}, flags={"init": str(model), "epochs": 0, "points": 16})
+    config, flags = {"epochs_dynamic": 0, "fine_tune": "auto"}, {"init": str(model), "epochs": 0, "points": 16}
+    given = Given("auto", config=config, flags=flags)
     assert load_model(train(str(data), str(tmp_path / "run"), given).weights)[1].config.points_per_frame == 16
+    assert "learns: probe" in capsys.readouterr().err
     with pytest.raises(UsageError, match="2 frames x 2 points = 4 are fewer than 8 centroids"):
         train(str(tmp_path / "none.h5"), str(tmp_path / "x"), Given("auto", flags={"init": str(model), "points": 2}))
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.descriptors import clip_descriptors
+from dpcli.classify.network.descriptors import LEVELS, clip_descriptors
 from dpcli.classify.network.forest import Forest
 from dpcli.classify.network.layers import ClipLinear, RowNorm
 from dpcli.classify.network.sync_norm import has_synchronized_norms
@@ -23,7 +23,6 @@ _REACH = 3  # slots that a layer over time sees
 _STEPS = (1, 2, 4)  # between these slots, a layer each
 _DROPPED = 0.1  # after each layer over time
 _LEAST = 1e-12  # the probability that 0 is taken for
-_LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)  # of the quantiles of a slot
 _READ = 16  # numbers of each slot that are read at its place in the video
 _COPIES = 4  # of a clip: as it is, mirrored, reversed in time, and both
 
@@ -104,7 +103,7 @@ class _Member(nn.Module):
         first, second = config.widths[0]
         width = config.widths[1][0]
         self.points = nn.Sequential(*_layer(4 + len(config.columns), first), *_layer(first, second))
-        quantiles = len(_LEVELS) * (3 + len(config.columns)) if config.slot_details else 0
+        quantiles = len(LEVELS) * (3 + len(config.columns)) if config.slot_details else 0
         self.slots = nn.Sequential(*_layer(2 * second + 1 + quantiles, width))
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
         self.over_time = nn.ModuleList(_TemporalConvolution(width, step) for step in _STEPS)
@@ -178,7 +177,7 @@ def slot_quantiles(clips: Tensor) -> Tensor:
     values = torch.cat([clips[..., :3], clips[..., 5:]], -1)
     ordered = torch.where(there, values, values.new_tensor(float("inf"))).sort(2).values
     last = there.sum(2, keepdim=True) - 1
-    places = torch.cat([(level * last.clamp(min=0)).round().long() for level in _LEVELS], 2)
+    places = torch.cat([(level * last.clamp(min=0)).round().long() for level in LEVELS], 2)
     found = ordered.gather(2, places.expand(-1, -1, -1, values.shape[-1]))
     return torch.where(last >= 0, found, torch.zeros_like(found)).flatten(2)
 
