@@ -132,16 +132,12 @@ class MSRAction3D:
     focal: float = _FOCAL  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not (self.focal > 0 and self.scale > 0):
             raise UsageError(f"--focal and --scale must be positive, found {self.focal:g} and {self.scale:g}")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:

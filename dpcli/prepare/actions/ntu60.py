@@ -155,6 +155,7 @@ class NTU60:
     protocol: str = "xsub"
     intrinsics: Intrinsics = INTRINSICS["peers"]
     scale: float = 655.35
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
@@ -162,11 +163,6 @@ class NTU60:
             raise UsageError(f"--protocol {self.protocol}: expected {' or '.join(PUBLISHED)}")
         if not self.scale > 0:
             raise UsageError(f"--scale {self.scale:g}: expected millimeters per unit of length, more than 0")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:

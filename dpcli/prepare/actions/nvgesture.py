@@ -103,17 +103,13 @@ class NvGesture:
     foreground: str = "otsu"  # otsu | none
     erode: int = 1  # passes of 3x3 erosion
     coordinates: str = "image"  # image: row, column, gray level | camera: pinhole with depth 255 - gray level
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         for option, allowed in (("foreground", ("otsu", "none")), ("coordinates", ("image", "camera"))):
             if getattr(self, option) not in allowed:
                 raise UsageError(f"--{option} {getattr(self, option)}: expected {' or '.join(allowed)}")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:

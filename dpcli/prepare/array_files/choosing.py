@@ -14,20 +14,7 @@ from dpcli.prepare.array_files.axes import are_poses, coordinates_axis
 from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_names
 
-POINT_KEYS = (
-    "points",
-    "xyz",
-    "pos",
-    "point_cloud",
-    "point_clouds",
-    "pointcloud",
-    "clouds",
-    "pc",
-    "pcs",
-    "pcd",
-    "vertices",
-    "verts",
-)
+POINT_KEYS = tuple("points xyz pos point_cloud point_clouds pointcloud clouds pc pcs pcd vertices verts".split())
 _BESIDE = re.compile(
     r"(.*[/_.])?(normals?|colou?rs?|rgb|flows?|scene_?flow|veloc\w*|vel|feat\w*|faces?|triangles|edges|weights?|masks?|valids?|"
     r"poses?|transforms?|rotations?|trans\w*|(in|ex)trinsics?|cameras?|joints?_?(names|parents)|images?|depths?|labels?|y|times?|"

@@ -233,13 +233,9 @@ class Loaded:
 
     def frames(self, part: Rows) -> list[Cloud]:
         """Returns the frames of one sequence."""
-        found = []
-        for start, stop in zip(part.offsets[:-1], part.offsets[1:]):
-            rows = part.rows[start:stop]
-            color = None if self.cloud.color is None else self.cloud.color[rows]
-            extra = {name: values[rows] for name, values in self.cloud.extra.items()}
-            track = None if self.cloud.track is None else self.cloud.track[rows]
-            found.append(Cloud(self.cloud.points[rows], color, self.cloud.unit, extra, track=track))
+        found = [replace(self.cloud, dropped={}) for _ in part.offsets[1:]]
+        for frame, start, stop in zip(found, part.offsets[:-1], part.offsets[1:]):
+            frame.keep(part.rows[start:stop])
         return found
 
 

@@ -107,6 +107,7 @@ class SyntheticGestures:
     noise: float = 1.0
     seed: int = 0
     length_unit: ClassVar[str] = "m"
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time", "part")
 
     def __post_init__(self) -> None:
@@ -114,11 +115,6 @@ class SyntheticGestures:
             value = getattr(self, option)
             if value < least:
                 raise UsageError(f"--{option.replace('_', '-')} {value}: expected {least} or more")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def config(self) -> dict[str, Any]:
