@@ -16,7 +16,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
-from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
@@ -97,8 +97,14 @@ class OwnScans:
             raise UsageError("--scale and --fps must be more than 0")
         Lengths(self.scale, self.unit)
 
+    def _in_folders(self) -> tuple[list[str], str]:
+        """Returns what `labels_of_folders` takes: the names of the samples, and what each holds at least."""
+        raise NotImplementedError
+
     @cached_property
     def _table(self) -> LabelTable | None:
+        if self.label_from_folder:
+            return labels_of_folders(self.raw, *self._in_folders())
         return read_labels(self.labels) if self.labels else None
 
     def fields_beside(self, *, time: object, color: object) -> tuple[str, ...]:

@@ -24,8 +24,7 @@ from dpcli.prepare.cloud_formats.column_names import (
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import EMPTY, cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
-from dpcli.prepare.decode.folder_listing import walk_folders
-from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
+from dpcli.prepare.decode.folder_listing import named_below, walk_folders
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
@@ -88,12 +87,7 @@ class TableSequences(OwnScans):
         found = found or [path for path in _tables_below(self.raw, SUFFIXES) if not made_by_dpc(path)]
         if not found:
             raise DataError(f"{self.raw}: no tables ({', '.join((*TABLES, *SUFFIXES))})")
-        named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in found}
-        if len(named) < len(found):
-            shown = {*named.values()}
-            twins = next(path for path in found if path not in shown)
-            raise DataError(f"{twins}: there is a table of the same name in another format; keep one of them")
-        return named
+        return named_below(self.raw, found, "table")
 
     @cached_property
     def _found(self) -> tuple[bool, bool]:
@@ -107,12 +101,8 @@ class TableSequences(OwnScans):
             return loaded.cloud.color is not None, timed
         return False, bool(self.fps)
 
-    @cached_property
-    def _table(self) -> LabelTable | None:
-        if self.labels:
-            return read_labels(self.labels)
-        names = [item.name for item in self._items]
-        return labels_of_folders(self.raw, names, "CLASS/TABLE") if self.label_from_folder else None
+    def _in_folders(self) -> tuple[list[str], str]:
+        return [item.name for item in self._items], "CLASS/TABLE"
 
     @cached_property
     def _items(self) -> list[Item]:
