@@ -128,7 +128,7 @@ class DepthVideos:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
+        return self._table.class_names
 
     @property
     def config(self) -> dict[str, Any]:
@@ -151,10 +151,10 @@ class DepthVideos:
         return self.fps is not None or all(_tells_time(item) for item in self._found)
 
     @cached_property
-    def _table(self) -> LabelTable | None:
+    def _table(self) -> LabelTable:
         if self.label_from_folder:
             return labels_of_folders(self.inputs[0], [item.name for item in self._found], "CLASS/VIDEO")
-        return read_labels(self.labels) if self.labels else None
+        return read_labels(self.labels) if self.labels else LabelTable()
 
     @cached_property
     def _chosen(self) -> tuple[list[tuple[Path, Series | None, Path]], list[str]]:
@@ -186,7 +186,7 @@ class DepthVideos:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         told = {"timed": self._timed}
         items = [replace(item, extra={**item.extra, **told}) for item in self._found]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -317,7 +317,7 @@ class DepthVideos:
                 f"no times are written: {first_names(silent, 3)} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 def _tells_time(item: Item) -> bool:

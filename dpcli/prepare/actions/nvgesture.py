@@ -132,13 +132,11 @@ class NvGesture:
         for split, found in lists.items():
             for number, line in enumerate(read_text(found[-1]).splitlines() if found else [], start=1):
                 if line.strip():
-                    item = self._item(line, split, f"{found[-1]}:{number}")
-                    duplicate = item.name in items
-                    if duplicate:
-                        where = f"{found[-1]}:{number}"
-                        item = Item(
-                            f"{item.name} ({where})", item.path, split, problem=f"{where}: {item.name} is listed twice"
-                        )
+                    where = f"{found[-1]}:{number}"
+                    item = self._item(line, split, where)
+                    if item.name in items:
+                        problem = f"{where}: {item.name} is listed twice"
+                        item = Item(f"{item.name} ({where})", item.path, split, problem=problem)
                     items[item.name] = item
         if not items:
             raise DataError(f"{folder}: the list files are empty; expected one line per clip")

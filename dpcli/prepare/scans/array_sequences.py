@@ -156,11 +156,11 @@ class ArraySequences(OwnScans):
         return [item.name for item in self._items], "CLASS/FILE"
 
     @cached_property
-    def _table(self) -> LabelTable | None:
+    def _table(self) -> LabelTable:
         return super()._table if self.labels or self.label_from_folder else self._labels_inside()
 
-    def _labels_inside(self) -> LabelTable | None:
-        """Returns the labels that files hold beside each sequence, or beside many, whole numbers from 0; None without them."""
+    def _labels_inside(self) -> LabelTable:
+        """Returns the labels that files hold beside each sequence, or beside many, whole numbers from 0; no rows without them."""
         rows: dict[str, Row] = {}
         good: dict[Path, list[Item]] = {}
         for item in self._items:
@@ -173,7 +173,7 @@ class ArraySequences(OwnScans):
                     try:
                         labels = self._stored(own[0], arrays).beside.labels
                     except DataError:
-                        return None
+                        return LabelTable()
                     values = np.asarray(arrays[labels][()]).reshape(-1) if labels else np.zeros(0)
             if (
                 len(values) != len(own)
@@ -181,10 +181,10 @@ class ArraySequences(OwnScans):
                 or values.min() < -1  # of those that nobody knows
                 or values.max() > _MOST_CLASSES
             ):
-                return None
+                return LabelTable()
             rows |= {item.name: Row(int(label), -1, "") for item, label in zip(own, values)}
         if max((row.label for row in rows.values()), default=-1) < 0:
-            return None
+            return LabelTable()
         return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
 
     def items(self) -> list[Item]:
@@ -194,7 +194,7 @@ class ArraySequences(OwnScans):
             Item(one.name, one.path, extra={**one.extra, "time": time, "color": color}, problem=one.problem)
             for one in self._items
         ]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -247,7 +247,7 @@ class ArraySequences(OwnScans):
         if good:
             lines[0] += self._how(good)
         lines += left_out_below(self.raw, SUFFIXES)
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
     def _how(self, item: Item) -> str:
         """Returns how the axes of the first array are taken, and which arrays beside it are not read."""
@@ -263,9 +263,10 @@ class ArraySequences(OwnScans):
                     beside += [*beside_frames(arrays, own).named(), *find_times_of_groups(arrays, own)]
                 if not self._first[0] or self.fps:  # what doesn't rise isn't read
                     beside = [name for name in beside if not says_times(name)]
-                if self._table is None or self.labels or self.label_from_folder:
+                labels_inside = self._table.rows and not (self.labels or self.label_from_folder)
+                if not labels_inside:
                     beside = [name for name in beside if not says_label(name)]
-                if self._table is not None and source.place is None and not (self.labels or self.label_from_folder):
+                if labels_inside and source.place is None:
                     groups = {own.group for own in sources}
                     beside += [name for name in arrays if says_label(name) and name.rpartition("/")[0] in groups]
                 used = {*keys, *beside, *with_track(self.keep, self.track)}

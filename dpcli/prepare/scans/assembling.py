@@ -102,10 +102,10 @@ class OwnScans:
         raise NotImplementedError
 
     @cached_property
-    def _table(self) -> LabelTable | None:
+    def _table(self) -> LabelTable:
         if self.label_from_folder:
             return labels_of_folders(self.raw, *self._in_folders())
-        return read_labels(self.labels) if self.labels else None
+        return read_labels(self.labels) if self.labels else LabelTable()
 
     def fields_beside(self, *, time: object, color: object) -> tuple[str, ...]:
         """Returns the optional fields that every sample has, given whether all have times, and colors."""
@@ -115,7 +115,7 @@ class OwnScans:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
+        return self._table.class_names
 
     @property
     def length_unit(self) -> str:

@@ -92,7 +92,7 @@ class CloudFolders(OwnScans):
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, series.folder, extra={**told, "series": series}))
-        return self._with_labels(items) if self._table else items
+        return self._with_labels(items)
 
     def _with_labels(self, items: list[Item]) -> list[Item]:
         """Returns items with what the table says of them. Raises DataError when it names a stranger, and says so where the names
@@ -147,7 +147,7 @@ class CloudFolders(OwnScans):
                 " put it into a folder of its own (CLASS/SEQUENCE/frames), or give --frame-column where it is a table of frames"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items])
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:

@@ -72,7 +72,7 @@ class RecordedClouds(OwnScans):
         """Returns the index in its final order. Raises DataError when there is no recording."""
         color, unread = self._first
         items = [Item(name, path, extra={"color": color, "unread": unread}) for name, path in self._names.items()]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -98,4 +98,4 @@ class RecordedClouds(OwnScans):
             lines.append(
                 f"left out, not .bag, .mcap or .db3: {first_names(others, _LISTED)}; unpack or finish them first"
             )
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)

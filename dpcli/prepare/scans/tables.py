@@ -121,19 +121,11 @@ class TableSequences(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        return self._table.apply(self._items) if self._table else self._items
+        return self._table.apply(self._items)
 
     def _load(self, path: Path) -> Loaded:
         facts = path.stat()
-        return _load(
-            path,
-            (facts.st_size, facts.st_mtime_ns),
-            self.frame_column,
-            self.sequence_column,
-            self.gap,
-            self.keep,
-            self.track,
-        )
+        return _load(self, path, facts.st_size, facts.st_mtime_ns)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -190,7 +182,7 @@ class TableSequences(OwnScans):
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
         read = {path.suffix.lower() for path in self._paths.values()}
         lines += left_out_below(self.raw, (*TABLES, *read))
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 @dataclass(frozen=True)
@@ -230,33 +222,28 @@ class Loaded:
 
 
 @lru_cache(maxsize=2)  # a table holds many sequences; each process reads it once
-def _load(
-    path: Path,
-    facts: tuple[int, int],
-    wanted: str,
-    sequences: str,
-    gap: float | None,
-    keep: tuple[str, ...],
-    track: str,
-) -> Loaded:
-    if not facts[0]:
+def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loaded:
+    if not size:
         raise DataError(f"{path}: the file is empty")
+    in_columns = reader.track == COLUMNS
     try:
-        wide = read_wide(path) if track == COLUMNS else None
+        wide = read_wide(path) if in_columns else None
         table = wide.table if wide else _open_table(path)
-        rows_count = wide is not None and not (wanted or sequences or gap or find_frame_column(table.names))
-        column = "" if rows_count else frame_column(table, wanted)
-        cloud = wide.cloud(keep) if wide else cloud_of_table(table, keep)
+        told = reader.frame_column or reader.sequence_column or reader.gap or find_frame_column(table.names)
+        rows_count = wide is not None and not told
+        column = "" if rows_count else frame_column(table, reader.frame_column)
+        cloud = wide.cloud(reader.keep) if wide else cloud_of_table(table, reader.keep)
     except DataError as error:
-        raise (stand_in(path) or (error if track == COLUMNS else hint(path, error))) from None
+        raise (stand_in(path) or (error if in_columns else hint(path, error))) from None
     if isinstance(table, TextTable) and (empty := table.empty_rows):
         cloud.dropped = {**cloud.dropped, EMPTY: empty}
-    cloud.track = name_rows(table, track) if track not in ("", ROWS, COLUMNS) else cloud.track
-    axes = cloud.columns
-    unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    named = [] if sequences else find_recording_columns(unused)
+    if reader.track not in ("", ROWS, COLUMNS):
+        cloud.track = name_rows(table, reader.track)
+    apart = {*cloud.columns, column, reader.sequence_column}
+    unused = tuple(name for name in table.names if name and name not in apart)
+    named = [] if reader.sequence_column else find_recording_columns(unused)
     recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
-    parts = wide.rows() if wide and rows_count else split_rows(table, column, sequences, gap)
+    parts = wide.rows() if rows_count else split_rows(table, column, reader.sequence_column, reader.gap)
     clocks = find_clocks(table, unused)
     if wide:
         parts, points = [wide.spread(part) for part in parts], len(wide.trios)
