@@ -15,8 +15,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, require_folder, sample_of_frames
 
 CLASS_NAMES = (
     "high arm wave",
@@ -192,10 +191,8 @@ class MSRAction3D:
         if self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST:
             notes |= {_RESIZED: 1}
         points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
-        kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)
-        sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))
-        return Sample(sequence, {**notes, **dropped})
+        return sample_of_frames(item, points, counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

@@ -14,8 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, published_found, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, published_found, require_folder, sample_of_frames
 from dpcli.text_files import read_text
 
 CLASSES = 25
@@ -179,17 +178,16 @@ class NvGesture:
             raise DataError(f"{item.path}: ends before frame {start}; the list asks for frames {start} to {stop - 1}")
         clouds = [self._points(frame) for frame in frames]
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
-        kept, notes = drop_empty_frames(str(item.path), counts)
+        notes = {}
         if self.coordinates == "image" and frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
             notes[_RESIZED] = 1
         if rate and abs(rate - _FPS) > 1:
             notes[_OTHER_RATE] = 1
         if len(frames) < stop - start:
             notes["frames listed beyond the end of a video"] = stop - start - len(frames)
-        sequence = CloudSequence(
-            item.name, np.concatenate(clouds), offsets(counts[kept]), time=kept / (rate or _FPS), **describe(item)
+        return sample_of_frames(
+            item, np.concatenate(clouds), counts, notes, time=np.arange(len(clouds)) / (rate or _FPS)
         )
-        return Sample(sequence, notes)
 
     def _points(self, frame: np.ndarray) -> np.ndarray:
         if frame.dtype != np.uint8:

@@ -143,11 +143,8 @@ def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
         named = list(zip(parse_names([f"{one}." for one in own]), names))  # no suffix: a point may stand in a number
         shapes = {own.shape for own, name in named if 0 not in arrays[name].shape}
         named = [(own, name) for own, name in named if own.shape in shapes]  # nothing was seen in those without points
-        if (
-            len(named) < 2
-            or len(shapes) != 1
-            or len((columns := NumberColumns([own for own, _ in named])).varying()) != 1
-        ):
+        columns = NumberColumns([own for own, _ in named])
+        if len(named) < 2 or len(shapes) != 1 or len(columns.varying()) != 1:
             continue
         counted, ordered = zip(*sorted(named, key=lambda pair: columns.key(pair[0])))
         filled = [arrays[name] for name in ordered if 0 not in arrays[name].shape]
