@@ -39,11 +39,10 @@ from dpcli.prepare.decode.depth_files import (
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.prepare.times_beside import with_times
-from dpcli.store import CloudSequence
 
 if TYPE_CHECKING:
     from dpcli.prepare.decode.pinhole_camera import Calibration
@@ -212,13 +211,9 @@ class DepthVideos:
         if not counts.any() and (seen > 0).any():
             raise DataError(f"{item.path}: {self._nothing_left(seen[seen > 0] / scale)}")
         require_plausible(str(item.path), points[:, 2], scale, asked=told)
-        kept, dropped = drop_empty_frames(str(item.path), counts)
-        sequence = CloudSequence(
-            item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
-        )
         if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
-        return Sample(sequence, {**notes, **dropped})
+        return sample_of_frames(item, points, counts, notes, time=self._times(item, video))
 
     def _nothing_left(self, seen: np.ndarray) -> str:
         """Returns which options took all that was seen, depths in meters."""
@@ -237,21 +232,21 @@ class DepthVideos:
         scale = None if read.frames[0].dtype.kind == "f" else scale  # these are meters
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
-    def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
-        """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
+    def _times(self, item: Item, video: DepthVideo) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (T), of the frames that were read; None when they are not known for all."""
         if not item.extra["timed"]:
             return None
         series: Series | None = item.extra["series"]
         if self.fps and series:
-            return series.frame_times(self.fps)[:: self.stride][kept]
+            return series.frame_times(self.fps)[:: self.stride]
         if self.fps:
-            return kept * self.stride / self.fps
+            return np.arange(len(video.frames)) * self.stride / self.fps
         if video.time is None:
             cut = (
                 f"truncated, it lacks {counted(video.missing, 'frame')} that it declares, and " if video.missing else ""
             )
             raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
-        return video.time[kept]
+        return video.time
 
     @property
     def _declared_scale(self) -> float | None:
