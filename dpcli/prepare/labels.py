@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -30,11 +30,11 @@ class Row:
 
 @dataclass(frozen=True)
 class LabelTable:
-    """Holds rows by sample name, and the class names that their labels index."""
+    """Holds rows by sample name, and the class names that their labels index; without rows it says nothing."""
 
-    path: Path
-    rows: dict[str, Row]
-    class_names: list[str]
+    path: Path = Path()
+    rows: dict[str, Row] = field(default_factory=dict)
+    class_names: list[str] = field(default_factory=list)
 
     def apply(self, items: list[Item]) -> list[Item]:
         """Returns items with the table's fields; one it doesn't name keeps label -1.
@@ -48,7 +48,7 @@ class LabelTable:
 
     def unnamed(self, items: list[Item]) -> list[str]:
         """Returns a line for the log about the samples that the table doesn't name; none when it names all."""
-        names = [item.name for item in items if item.label < 0 and not item.problem]
+        names = [item.name for item in items if item.label < 0 and not item.problem] if self.rows else []
         return [f"{len(names)} without a label in {self.path}: {first_names(names)}"] if names else []
 
 

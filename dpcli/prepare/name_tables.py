@@ -46,11 +46,9 @@ def read_rows(path: Path, needed: str) -> dict[str, dict[str, str]]:
     if numbered and (names := _header(numbered[0][1], needed)):
         header = names
         if needed not in header or len(set(header)) < len(header):
-            found, others = (
-                ",".join(numbered[0][1]),
-                "and perhaps " + ", ".join(c for c in COLUMNS if c not in ("name", needed)),
-            )
-            raise DataError(f"{path}:{numbered[0][0]}: columns {found}; expected name,{needed} {others}")
+            number, found = numbered[0]
+            others = ", ".join(column for column in COLUMNS if column not in ("name", needed))
+            raise DataError(f"{path}:{number}: columns {','.join(found)}; expected name,{needed} and perhaps {others}")
         numbered.pop(0)
         if others := [name for name in header if name and name not in COLUMNS]:
             log.warn(f"{path}: columns not read: {', '.join(others)}")

@@ -147,6 +147,27 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
     return kept, {"frames without points dropped": dropped} if dropped else {}
 
 
+def sample_of_frames(
+    item: Item,
+    points: np.ndarray,
+    counts: np.ndarray,
+    notes: Mapping[str, int],
+    *,
+    time: np.ndarray | None = None,
+    where: Path | None = None,
+    **fields: Any,
+) -> Sample:
+    """Returns the sample of an item's points f32 (P,3), of which each frame has ``counts`` i64 (T), without empty frames.
+
+    notes: what else was left out. time: of every frame, f64 (T), or None. where: the item's place in messages, if not its
+    path. fields: those of a CloudSequence, of its points. Raises DataError where no frame has points.
+    """
+    kept, dropped = drop_empty_frames(str(where or item.path), counts)
+    time = None if time is None else time[kept]
+    sequence = CloudSequence(item.name, points, offsets(counts[kept]), time=time, **fields, **describe(item))
+    return Sample(sequence, {**notes, **dropped})
+
+
 def offsets(counts: np.ndarray) -> np.ndarray:
     """Returns offsets i64 (T+1) that start with 0, of counts i64 (T).
 

@@ -27,6 +27,7 @@ from typing import Any
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.series import is_hidden
 from dpcli.runtime.progress import log
@@ -117,7 +118,7 @@ class Tree:
         """Returns the size of every file by its path."""
         if self.folder.is_file():
             return {self.folder.name: self.folder.stat().st_size}
-        return dict(_walk(self.folder, ""))
+        return dict(_sizes_below(self.folder))
 
     def find(self, pattern: str) -> list[str]:
         """Returns files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
@@ -127,27 +128,15 @@ class Tree:
         return sorted(name for name in self.files if fits(name))
 
 
-def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
-    """Yields path and size of every file that isn't hidden; follows links to folders, but none that lead back to where they came
-    from.
-    """
-    stack = [(folder, prefix, (folder.resolve(),))]
-    while stack:
-        here, before, parents = stack.pop()
-        with os.scandir(here) as entries:
-            for entry in entries:
-                if is_hidden(entry.name):
-                    continue
-                name = before + entry.name
-                try:
-                    if entry.is_dir():
-                        target = Path(entry.path).resolve() if entry.is_symlink() else Path(entry.path)
-                        if target not in parents:
-                            stack.append((Path(entry.path), name + "/", (*parents, target)))
-                    else:
-                        yield name, entry.stat().st_size
-                except OSError:
-                    yield name, -1
+def _sizes_below(root: Path) -> Iterator[tuple[str, int]]:
+    """Yields path and size of every file below a folder that isn't hidden, -1 of links to nowhere."""
+    for folder, _, names in walk_folders(root):
+        above = "" if folder == str(root) else f"{os.path.relpath(folder, root)}/"
+        for name in (name for name in names if not is_hidden(name)):
+            try:
+                yield above + name, os.stat(os.path.join(folder, name)).st_size
+            except OSError:
+                yield above + name, -1
 
 
 def _pattern_to_regex(pattern: str) -> str:

@@ -226,7 +226,7 @@ def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
     found = [_made(folder, part) for group in apart for part in _objects(group)]
     scattered = sum(len(one.names) for one in found if one.numbered and len(one.names) == 1)
     if scattered > 2 and 2 * scattered > sum(len(one.names) for one in found if one.numbered):
-        found = _joined(folder, found)  # such as hashes: their letters are no pattern
+        found = _by_suffix(found)  # such as hashes: their letters are no pattern
     return sorted(found, key=lambda one: (-len(one.names), one.names))
 
 
@@ -292,15 +292,17 @@ def _made(folder: Path, names: list[Name]) -> Series:
     return Series(folder, ordered, pattern, numbered=numbered, suffix=names[0].suffix)
 
 
-def _joined(folder: Path, found: list[Series]) -> list[Series]:
+def _by_suffix(found: list[Series]) -> list[Series]:
     """Returns one series for each suffix."""
-    by_suffix: dict[str, list[str]] = {}
-    for one in found:
-        by_suffix.setdefault(one.suffix, []).extend(one.names)
-    return [
-        Series(folder, tuple(sorted(names, key=natural_key)), f"*{suffix}", numbered=False, suffix=suffix)
-        for suffix, names in by_suffix.items()
-    ]
+    suffixes = dict.fromkeys(one.suffix for one in found)
+    groups = [[one for one in found if one.suffix == suffix] for suffix in suffixes]
+    return [_joined(same, f"*{suffix}", suffix) for suffix, same in zip(suffixes, groups)]
+
+
+def _joined(found: list[Series], pattern: str, suffix: str = "") -> Series:
+    """Returns all files of some series of one folder as one, in the natural order of their names."""
+    names = sorted((name for one in found for name in one.names), key=natural_key)
+    return Series(found[0].folder, tuple(names), pattern, numbered=False, suffix=suffix)
 
 
 def _counted_in_hex(names: Sequence[str]) -> list[str]:
@@ -378,13 +380,8 @@ def _by_pattern(folder: Path, names: list[str], pattern: str) -> Series | None:
         return None
     found = all_series(folder, matching)
     others = all_series(folder, [name for name in names if not fnmatchcase(name, pattern)])
-    one = found[0] if len(found) == 1 else _joined_all(folder, found, pattern)
+    one = found[0] if len(found) == 1 else _joined(found, pattern)
     return replace(one, left_out=tuple(other.described() for other in others))
-
-
-def _joined_all(folder: Path, found: list[Series], pattern: str) -> Series:
-    names = sorted((name for one in found for name in one.names), key=natural_key)
-    return Series(folder, tuple(names), pattern, numbered=False)
 
 
 def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:

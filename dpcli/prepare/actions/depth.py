@@ -39,11 +39,10 @@ from dpcli.prepare.decode.depth_files import (
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.prepare.times_beside import with_times
-from dpcli.store import CloudSequence
 
 if TYPE_CHECKING:
     from dpcli.prepare.decode.pinhole_camera import Calibration
@@ -128,7 +127,7 @@ class DepthVideos:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
+        return self._table.class_names
 
     @property
     def config(self) -> dict[str, Any]:
@@ -151,10 +150,10 @@ class DepthVideos:
         return self.fps is not None or all(_tells_time(item) for item in self._found)
 
     @cached_property
-    def _table(self) -> LabelTable | None:
+    def _table(self) -> LabelTable:
         if self.label_from_folder:
             return labels_of_folders(self.inputs[0], [item.name for item in self._found], "CLASS/VIDEO")
-        return read_labels(self.labels) if self.labels else None
+        return read_labels(self.labels) if self.labels else LabelTable()
 
     @cached_property
     def _chosen(self) -> tuple[list[tuple[Path, Series | None, Path]], list[str]]:
@@ -186,7 +185,7 @@ class DepthVideos:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         told = {"timed": self._timed}
         items = [replace(item, extra={**item.extra, **told}) for item in self._found]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -212,13 +211,9 @@ class DepthVideos:
         if not counts.any() and (seen > 0).any():
             raise DataError(f"{item.path}: {self._nothing_left(seen[seen > 0] / scale)}")
         require_plausible(str(item.path), points[:, 2], scale, asked=told)
-        kept, dropped = drop_empty_frames(str(item.path), counts)
-        sequence = CloudSequence(
-            item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
-        )
         if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
-        return Sample(sequence, {**notes, **dropped})
+        return sample_of_frames(item, points, counts, notes, time=self._times(item, video))
 
     def _nothing_left(self, seen: np.ndarray) -> str:
         """Returns which options took all that was seen, depths in meters."""
@@ -237,21 +232,21 @@ class DepthVideos:
         scale = None if read.frames[0].dtype.kind == "f" else scale  # these are meters
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
-    def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
-        """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
+    def _times(self, item: Item, video: DepthVideo) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (T), of the frames that were read; None when they are not known for all."""
         if not item.extra["timed"]:
             return None
         series: Series | None = item.extra["series"]
         if self.fps and series:
-            return series.frame_times(self.fps)[:: self.stride][kept]
+            return series.frame_times(self.fps)[:: self.stride]
         if self.fps:
-            return kept * self.stride / self.fps
+            return np.arange(len(video.frames)) * self.stride / self.fps
         if video.time is None:
             cut = (
                 f"truncated, it lacks {counted(video.missing, 'frame')} that it declares, and " if video.missing else ""
             )
             raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
-        return video.time[kept]
+        return video.time
 
     @property
     def _declared_scale(self) -> float | None:
@@ -317,7 +312,7 @@ class DepthVideos:
                 f"no times are written: {first_names(silent, 3)} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 def _tells_time(item: Item) -> bool:

@@ -15,8 +15,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, require_folder, sample_of_frames
 
 CLASS_NAMES = (
     "high arm wave",
@@ -132,16 +131,12 @@ class MSRAction3D:
     focal: float = _FOCAL  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not (self.focal > 0 and self.scale > 0):
             raise UsageError(f"--focal and --scale must be positive, found {self.focal:g} and {self.scale:g}")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
@@ -196,10 +191,8 @@ class MSRAction3D:
         if self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST:
             notes |= {_RESIZED: 1}
         points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
-        kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)
-        sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))
-        return Sample(sequence, {**notes, **dropped})
+        return sample_of_frames(item, points, counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

@@ -18,9 +18,8 @@ from dpcli.prepare.decode.calibration import read_calibration
 from dpcli.prepare.decode.folder_listing import folder_files, is_folder, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.reader import Item, Sample, sample_of_frames
 from dpcli.prepare.series import is_hidden
-from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
     "drink water",
@@ -155,6 +154,7 @@ class NTU60:
     protocol: str = "xsub"
     intrinsics: Intrinsics = INTRINSICS["peers"]
     scale: float = 655.35
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
@@ -162,11 +162,6 @@ class NTU60:
             raise UsageError(f"--protocol {self.protocol}: expected {' or '.join(PUBLISHED)}")
         if not self.scale > 0:
             raise UsageError(f"--scale {self.scale:g}: expected millimeters per unit of length, more than 0")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
@@ -268,16 +263,14 @@ class NTU60:
             depth = decode_depth_png(data, f"{where}/MDepth-{number:08}.png", (WIDTH, HEIGHT))
             clouds.append(back_project(depth[None], self.intrinsics)[0])
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
-        kept, notes = drop_empty_frames(str(where), counts)
         points = np.concatenate(clouds)
         points *= np.float32(1 / self.scale)
-        time = (numbers[kept] - numbers[0]) / FPS
-        missing = int(numbers[-1] - np.count_nonzero(numbers))
-        if missing:
+        notes = {}
+        if missing := int(numbers[-1] - np.count_nonzero(numbers)):
             notes["frames missing in the numbering from 1"] = missing
         if others:
             notes["pictures left out, whose name is not MDepth-NUMBER.png"] = len(others)
-        return Sample(CloudSequence(item.name, points, offsets(counts[kept]), time=time, **describe(item)), notes)
+        return sample_of_frames(item, points, counts, notes, time=(numbers - numbers[0]) / FPS, where=where)
 
     def _frames(self, item: Item, where: Path) -> tuple[list[tuple[int, Path | bytes]], list[str]]:
         """Returns (number, file or content) of the frames of a video, sorted, and the names of other pictures beside them."""

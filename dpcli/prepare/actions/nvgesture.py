@@ -14,8 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, published_found, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, published_found, require_folder, sample_of_frames
 from dpcli.text_files import read_text
 
 CLASSES = 25
@@ -103,17 +102,13 @@ class NvGesture:
     foreground: str = "otsu"  # otsu | none
     erode: int = 1  # passes of 3x3 erosion
     coordinates: str = "image"  # image: row, column, gray level | camera: pinhole with depth 255 - gray level
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         for option, allowed in (("foreground", ("otsu", "none")), ("coordinates", ("image", "camera"))):
             if getattr(self, option) not in allowed:
                 raise UsageError(f"--{option} {getattr(self, option)}: expected {' or '.join(allowed)}")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
@@ -136,13 +131,11 @@ class NvGesture:
         for split, found in lists.items():
             for number, line in enumerate(read_text(found[-1]).splitlines() if found else [], start=1):
                 if line.strip():
-                    item = self._item(line, split, f"{found[-1]}:{number}")
-                    duplicate = item.name in items
-                    if duplicate:
-                        where = f"{found[-1]}:{number}"
-                        item = Item(
-                            f"{item.name} ({where})", item.path, split, problem=f"{where}: {item.name} is listed twice"
-                        )
+                    where = f"{found[-1]}:{number}"
+                    item = self._item(line, split, where)
+                    if item.name in items:
+                        problem = f"{where}: {item.name} is listed twice"
+                        item = Item(f"{item.name} ({where})", item.path, split, problem=problem)
                     items[item.name] = item
         if not items:
             raise DataError(f"{folder}: the list files are empty; expected one line per clip")
@@ -185,17 +178,16 @@ class NvGesture:
             raise DataError(f"{item.path}: ends before frame {start}; the list asks for frames {start} to {stop - 1}")
         clouds = [self._points(frame) for frame in frames]
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
-        kept, notes = drop_empty_frames(str(item.path), counts)
+        notes = {}
         if self.coordinates == "image" and frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
             notes[_RESIZED] = 1
         if rate and abs(rate - _FPS) > 1:
             notes[_OTHER_RATE] = 1
         if len(frames) < stop - start:
             notes["frames listed beyond the end of a video"] = stop - start - len(frames)
-        sequence = CloudSequence(
-            item.name, np.concatenate(clouds), offsets(counts[kept]), time=kept / (rate or _FPS), **describe(item)
+        return sample_of_frames(
+            item, np.concatenate(clouds), counts, notes, time=np.arange(len(clouds)) / (rate or _FPS)
         )
-        return Sample(sequence, notes)
 
     def _points(self, frame: np.ndarray) -> np.ndarray:
         if frame.dtype != np.uint8:

@@ -18,8 +18,7 @@ from dpcli.prepare.actions.pts_label import PtsLabel
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
 from dpcli.prepare.median import median
-from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Reader, Sample, require_folder, sample_of_frames
 
 KEYS = {"msraction3d": "point_clouds", "ntu60": "data"}  # what MeteorNet's and PSTNet's scripts call the array
 _NO_SHARE = 0.5  # units of the output of this many and more stored units are 33 m where these are shares of 65535 mm
@@ -158,10 +157,8 @@ class PeerClouds:
             raise DataError(f"{item.path}: no array {wanted!r} in it; found: {found}")
         frames = read_frames(item.path, key)
         counts = np.array([len(frame) for frame in frames], np.int64)
-        kept, notes = drop_empty_frames(str(item.path), counts)
-        points = np.concatenate(frames) * np.float32(1 / self._scale)
-        notes |= self._doubts(points)
-        return Sample(CloudSequence(item.name, points, offsets(counts[kept]), **describe(item)), notes)
+        points = np.concatenate([np.zeros((0, 3), np.float32), *frames]) * np.float32(1 / self._scale)
+        return sample_of_frames(item, points, counts, self._doubts(points))
 
     def _doubts(self, points: np.ndarray) -> dict[str, int]:
         """Returns a note where points f32 (P,3) are, by the usual scale, where no depth camera sees any; it names what may fit."""

@@ -26,8 +26,7 @@ from dpcli.prepare.actions.shrec17_lists import (
     gesture_names,
 )
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, natural_key, require_folder, sample_of_frames
 
 FILE = "pts_label.npy"
 _SHREC = re.compile(r"(?:.*/)?(gesture_(\d+)/finger_(\d+)/subject_(\d+)/essai_\d+)")
@@ -161,12 +160,9 @@ class PtsLabel:
         # a frame in which nothing was found was filled with points of depth 0
         seen = array[..., 2] > 0
         counts = seen.sum(1).astype(np.int64)
-        kept, notes = drop_empty_frames(str(item.path), counts)
-        partly = int((~seen)[kept].sum())
-        if partly:
-            notes["points of depth 0 dropped"] = partly
-        sequence = CloudSequence(item.name, array[seen].astype(np.float32), offsets(counts[kept]), **describe(item))
-        return Sample(sequence, notes)
+        partly = int((~seen)[counts > 0].sum())
+        notes = {"points of depth 0 dropped": partly} if partly else {}
+        return sample_of_frames(item, array[seen].astype(np.float32), counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

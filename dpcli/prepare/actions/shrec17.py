@@ -16,8 +16,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, published_found
-from dpcli.store import CloudSequence
+from dpcli.prepare.reader import Item, Sample, natural_key, published_found, sample_of_frames
 
 INTRINSICS = Intrinsics(463.889, 463.889, 320.0, 240.0)
 WIDTH, HEIGHT, FPS = 640, 480, 30.0
@@ -135,8 +134,6 @@ class Shrec17:
             x, y, right, bottom = _clip_to_image(regions[k]) if self.bbox else (0, 0, WIDTH, HEIGHT)
             cut += bool(self.bbox and [x, y, right - x, bottom - y] != regions[k].tolist())
             clouds.append(self._points(depth, x, y, right, bottom))
-        counts = np.array([len(cloud) for cloud in clouds], np.int64)
-        kept, dropped = drop_empty_frames(str(item.path), counts)
         more = len(ticks) - len(frames) - sum(notes.values())  # which frame a region belongs to is their order alone
         if more > 0:
             notes["regions beyond the frames of a sequence left out; do they belong together?"] = more
@@ -146,10 +143,8 @@ class Shrec17:
         if seconds is None:
             seconds = np.arange(len(frames)) / FPS
             notes["sequences without usable timestamps (30 frames/s assumed)"] = 1
-        sequence = CloudSequence(
-            item.name, np.concatenate(clouds), offsets(counts[kept]), time=seconds[kept], **describe(item)
-        )
-        return Sample(sequence, {**notes, **dropped})
+        counts = np.array([len(cloud) for cloud in clouds], np.int64)
+        return sample_of_frames(item, np.concatenate(clouds), counts, notes, time=seconds)
 
     def _frame_paths(self, item: Item) -> tuple[list[Path], dict[str, int]]:
         """Returns the files 0_depth.png ... as many as the list says; more of them are left out and counted."""

@@ -14,20 +14,7 @@ from dpcli.prepare.array_files.axes import are_poses, coordinates_axis
 from dpcli.prepare.reader import natural_key
 from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_names
 
-POINT_KEYS = (
-    "points",
-    "xyz",
-    "pos",
-    "point_cloud",
-    "point_clouds",
-    "pointcloud",
-    "clouds",
-    "pc",
-    "pcs",
-    "pcd",
-    "vertices",
-    "verts",
-)
+POINT_KEYS = tuple("points xyz pos point_cloud point_clouds pointcloud clouds pc pcs pcd vertices verts".split())
 _BESIDE = re.compile(
     r"(.*[/_.])?(normals?|colou?rs?|rgb|flows?|scene_?flow|veloc\w*|vel|feat\w*|faces?|triangles|edges|weights?|masks?|valids?|"
     r"poses?|transforms?|rotations?|trans\w*|(in|ex)trinsics?|cameras?|joints?_?(names|parents)|images?|depths?|labels?|y|times?|"
@@ -156,11 +143,8 @@ def _numbered(arrays: Mapping[str, Any]) -> list[Source]:
         named = list(zip(parse_names([f"{one}." for one in own]), names))  # no suffix: a point may stand in a number
         shapes = {own.shape for own, name in named if 0 not in arrays[name].shape}
         named = [(own, name) for own, name in named if own.shape in shapes]  # nothing was seen in those without points
-        if (
-            len(named) < 2
-            or len(shapes) != 1
-            or len((columns := NumberColumns([own for own, _ in named])).varying()) != 1
-        ):
+        columns = NumberColumns([own for own, _ in named])
+        if len(named) < 2 or len(shapes) != 1 or len(columns.varying()) != 1:
             continue
         counted, ordered = zip(*sorted(named, key=lambda pair: columns.key(pair[0])))
         filled = [arrays[name] for name in ordered if 0 not in arrays[name].shape]

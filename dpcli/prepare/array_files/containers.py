@@ -98,8 +98,7 @@ def open_arrays(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
         with reading(path), _open_hdf5(path) as found:
             yield found
         return
-    facts = path.stat()
-    yield _read_all(path, facts.st_size, facts.st_mtime_ns)
+    yield _read_all(path)
 
 
 def is_hdf5(path: Path) -> bool:
@@ -129,8 +128,7 @@ def tables_inside(path: Path) -> list[str]:
     import h5py
 
     if not is_hdf5(path):
-        facts = path.stat()
-        arrays = {} if path.suffix.lower() == ".mat" else _read_all(path, facts.st_size, facts.st_mtime_ns)
+        arrays = {} if path.suffix.lower() == ".mat" else _read_all(path)
         return [name for name, one in arrays.items() if not isinstance(one, list) and one.dtype.names]
     found: list[str] = []
 
@@ -152,7 +150,7 @@ def read_tables(path: Path) -> dict[str, tuple[dict[str, np.ndarray], dict[str, 
     """Returns the tables of `tables_inside` by name: their columns (N, or N and several) as stored, and their attributes."""
     names = tables_inside(path)
     if not names or not is_hdf5(path):
-        arrays = _read_all(path, path.stat().st_size, path.stat().st_mtime_ns) if names else {}
+        arrays = _read_all(path) if names else {}
         flat = {name: np.asarray(arrays[name]).reshape(-1) for name in names}
         return {name: ({own: one[own] for own in one.dtype.names or ()}, {}) for name, one in flat.items()}
     with reading(path), _hdf5_of_others(path) as file:
@@ -186,12 +184,8 @@ def _table_of(item: Any, path: Path) -> tuple[dict[str, np.ndarray], dict[str, A
 
 def _checked(item: h5py.Dataset, path: Path) -> h5py.Dataset:
     """Returns a data set. Raises DataError where its bytes are missing, elsewhere, or packed by a filter that is missing."""
-    if item.is_virtual or item.external:
-        raise DataError(f"{path}: {item.name} keeps its data in another file; copy them into one (h5repack)")
-    from dpcli.store.file import refuse_claim
-
-    refuse_claim(item, path)
-    _refuse_filters(item, path)
+    _refuse_elsewhere(item, path, item.name)
+    _require_bytes(item, path)
     return item
 
 
@@ -284,16 +278,12 @@ def _shown(file: h5py.File, item: h5py.Dataset, path: Path) -> Array | list[np.n
     """Returns a data set as its numbers are meant, the list of a MATLAB cell; None of anything else."""
     import h5py
 
-    from dpcli.store.file import refuse_claim
-
     if item.dtype == h5py.ref_dtype and item.ndim == 2 and 0 < item.size < _FEW:
-        refuse_claim(item, path)
         return _cells(file, item, path)
     if item.dtype.kind not in "uifb" or item.shape is None or _is_bare_dimension(item) or _is_no_array(item):
         return None
     try:
-        refuse_claim(item, path)
-        _refuse_filters(item, path)
+        _require_bytes(item, path)
     except DataError as error:
         return Unreadable(item, error)
     if path.suffix.lower() == ".mat":
@@ -323,10 +313,20 @@ def _is_bare_dimension(item: h5py.Dataset) -> bool:
     return _BARE_DIMENSION in str(item.attrs.get("NAME", ""))
 
 
-def _refuse_filters(item: h5py.Dataset, path: Path) -> None:
-    """Raises DataError for a data set that was packed by a filter that the HDF5 library here lacks, such as Blosc."""
+def _refuse_elsewhere(item: h5py.Dataset, path: Path, name: str) -> None:
+    if item.is_virtual or item.external:
+        raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
+
+
+def _require_bytes(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError for a data set whose bytes are missing, or packed by a filter that the HDF5 library here lacks, such as
+    Blosc.
+    """
     import h5py
 
+    from dpcli.store.file import refuse_claim
+
+    refuse_claim(item, path)
     plist = item.id.get_create_plist()
     for place in range(plist.get_nfilters()):
         code, _, _, name = plist.get_filter(place)
@@ -352,8 +352,7 @@ def _datasets(file: h5py.File, path: Path) -> list[tuple[str, h5py.Dataset]]:
             raise DataError(f"{path}: holds more than {_MOST} data sets; join those of one sequence")
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # #refs#, the contents of MATLAB's cells
             _require_type(item, path)
-            if item.is_virtual or item.external:
-                raise DataError(f"{path}: {name} keeps its data in another file; copy them into one (h5repack)")
+            _refuse_elsewhere(item, path, name)
             own = _name_in_octave(name) if name.split("/")[0] in of_octave else name
             found.extend([(own, item)] if own else [])
 
@@ -377,21 +376,26 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> np.ndarray | list
     """
     import h5py
 
-    from dpcli.store.file import refuse_claim
-
     of_structs = "MATLAB_class" not in item.attrs and item.parent.attrs.get("MATLAB_class") == b"struct"
     if item.attrs.get("MATLAB_class") != b"cell" and not of_structs:
         return None
+    _require_bytes(item, path)
     inside = [file[reference] for reference in item[()].reshape(-1)]
     if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_no_array(one) for one in inside):
         return None
     for one in inside:
-        refuse_claim(one, path)
+        _require_bytes(one, path)
     return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else one[()].T for one in inside])
 
 
+def _read_all(path: Path) -> Mapping[str, Array | list[np.ndarray]]:
+    """Returns the arrays of a file that is no HDF5."""
+    facts = path.stat()
+    return _read_once(path, facts.st_size, facts.st_mtime_ns)
+
+
 @lru_cache(maxsize=1)  # an array holds many sequences; each process reads it once
-def _read_all(path: Path, _size: int, _changed: int) -> Mapping[str, Array | list[np.ndarray]]:
+def _read_once(path: Path, _size: int, _changed: int) -> Mapping[str, Array | list[np.ndarray]]:
     if path.suffix.lower() == ".npy":
         return {"": _npy(path)}
     if path.suffix.lower() == ".mat":

@@ -144,11 +144,7 @@ class OgcRooms:
     class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "room width"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {}
+    config: ClassVar[dict[str, Any]] = {}
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""

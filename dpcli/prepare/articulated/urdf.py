@@ -343,7 +343,7 @@ def _walk_tree(path: Path, robot: Any) -> tuple[list[Any], dict[str, tuple[int, 
 def _check_numbers(path: Path, joint: Any) -> None:
     if joint.type in MOVABLE and (joint.axis.shape != (3,) or not 1e-9 < np.linalg.norm(joint.axis) < np.inf):
         raise DataError(f"{path}: joint {joint.name!r} has the axis {joint.axis}; expected three numbers, not all zero")
-    if joint.origin is not None and not np.isfinite(joint.origin).all():
+    if not np.isfinite(_origin(joint)).all():
         raise DataError(f"{path}: joint {joint.name!r} has an origin that is not finite")
 
 
@@ -376,16 +376,22 @@ def _moves(joint: Any) -> bool:
 
 def _fixed_motion(joint: Any) -> np.ndarray:
     """Returns what a joint that doesn't move does: its origin, and its one value when its limits are equal."""
-    origin = np.eye(4) if joint.origin is None else joint.origin
     if joint.type not in MOVABLE:
-        return origin
+        return _origin(joint)
+    own = _own_joint(joint, 0, 1, np.eye(4))
+    return own.origin @ joint_motion(own, np.array([own.lower]))[0]
+
+
+def _own_joint(joint: Any, parent: int, child: int, placement: np.ndarray) -> Joint:
+    """Returns a joint of yourdfpy, of a kind that moves, as one of ours. placement: of its parent's link in the parent's body."""
     low, high, _ = _limits(joint)
     kind = "prismatic" if joint.type == "prismatic" else "revolute"
-    return origin @ joint_motion(Joint(0, 1, kind, origin, _axis(joint), low, high), np.array([low]))[0]
+    axis = joint.axis / np.linalg.norm(joint.axis)
+    return Joint(parent, child, kind, placement @ _origin(joint), axis, low, high)
 
 
-def _axis(joint: Any) -> np.ndarray:
-    return joint.axis / np.linalg.norm(joint.axis)
+def _origin(element: Any) -> np.ndarray:
+    return np.eye(4) if element.origin is None else element.origin
 
 
 def _movable(
@@ -401,13 +407,10 @@ def _movable(
             if joint.type in MOVABLE:
                 notes[_EQUAL] += 1
             continue
-        low, high, odd = _limits(joint)
-        if odd:
+        if odd := _limits(joint)[2]:
             notes[odd] += 1
         body, placement = place[joint.parent]
-        origin = placement if joint.origin is None else placement @ joint.origin
-        kind = "prismatic" if joint.type == "prismatic" else "revolute"
-        joints.append(Joint(body, place[joint.child][0], kind, origin, _axis(joint), low, high))
+        joints.append(_own_joint(joint, body, place[joint.child][0], placement))
         sources.append(joint)
     return joints, sources
 
@@ -445,8 +448,7 @@ def _shapes(robot: Any, place: dict[str, tuple[int, np.ndarray]], notes: Counter
             body, placement = place[link.name]
             for shape in getattr(link, kind):
                 if shape.geometry is not None:
-                    origin = np.eye(4) if shape.origin is None else shape.origin
-                    shapes.append((body, placement @ origin, shape.geometry))
+                    shapes.append((body, placement @ _origin(shape), shape.geometry))
         if shapes:
             break
     if shapes and kind == "collisions":

@@ -15,10 +15,12 @@ from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
+    counts_rows,
     kept_columns,
+    refuse_frames,
     refuse_times,
     require_columns,
-    unnamed_columns,
+    unread_columns,
     without,
 )
 from dpcli.prepare.cloud_formats.column_names import find_frame_column, first_unit, note_of_units
@@ -114,13 +116,10 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
 
 
 def _refuse_frames(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Raises DataError where a column numbers several frames, which one cloud would mix up, as that of a table would."""
+    """Raises DataError where one of the columns holds whole numbers of several frames."""
     name = find_frame_column(list(columns))
-    values = np.unique(columns[name]) if name and columns[name].dtype.kind in "uif" else np.zeros(0)
-    if len(values) > 1 and (values == np.floor(values)).all():
-        raise DataError(
-            f"{path}: its column {name!r} numbers {len(values)} frames; --frame-column {name} makes them a sequence"
-        )
+    if name and columns[name].dtype.kind in "uif" and (columns[name] == np.floor(columns[name])).all():
+        refuse_frames(path, name, columns[name])
 
 
 def _has_points(arrays: Mapping[str, np.ndarray]) -> bool:
@@ -165,18 +164,16 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         )
     refuse_times(path, array)
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
-    counted = _counts_rows(array)
-    unread = (*(("column 1 (no name, numbers of the rows)",) * counted), *unnamed_columns(4 + counted, array.shape[1]))
-    return Cloud(array[:, counted : counted + 3].astype(kind), unread=unread)
+    first = _first_axis(array)
+    return Cloud(array[:, first : first + 3].astype(kind), unread=unread_columns(first, array.shape[1]))
 
 
-def _counts_rows(array: np.ndarray) -> bool:
-    """Returns whether the first column of an array counts its rows, from 0 or 1, before three columns of fractions."""
-    if len(array) < 3 or array.shape[1] < 4 or array.dtype.kind != "f" or array[0, 0] not in (0, 1):
-        return False
+def _first_axis(array: np.ndarray) -> int:
+    """Returns which column of an array is x: 0, or 1 behind one that counts the rows, before three columns of fractions."""
+    if array.shape[1] < 4 or array.dtype.kind != "f" or not counts_rows(array[:, 0]):
+        return 0
     axes = array[:, 1:4]
-    counts = np.array_equal(array[:, 0], np.arange(len(array)) + array[0, 0])
-    return counts and bool((axes != np.floor(axes)).any(0).all())
+    return int((axes != np.floor(axes)).any(0).all())
 
 
 def read_bin(path: Path, columns: int) -> Cloud:

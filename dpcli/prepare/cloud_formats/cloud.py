@@ -102,6 +102,30 @@ def unnamed_columns(first: int, last: int) -> tuple[str, ...]:
     return (f"column {first} (no name)" if first == last else f"columns {first} to {last} (no names)",)
 
 
+def unread_columns(first: int, width: int) -> tuple[str, ...]:
+    """Returns how to call columns without names beside x y z, of which x is column ``first`` from 0: behind one that counts the
+    rows, or the first.
+    """
+    return (*(("column 1 (no name, numbers of the rows)",) * first), *unnamed_columns(first + 4, width))
+
+
+def counts_rows(column: np.ndarray) -> bool:
+    """Returns whether a column (N) counts the rows, from 0 or 1.
+
+    >>> counts_rows(np.array([1.0, 2.0, 3.0])), counts_rows(np.array([2.0, 3.0, 4.0]))
+    (True, False)
+    """
+    return len(column) > 2 and column[0] in (0, 1) and np.array_equal(column, np.arange(len(column)) + column[0])
+
+
+def refuse_frames(path: Path, name: str, values: np.ndarray) -> None:
+    """Raises DataError where the column that numbers frames has several values, which one cloud would mix up."""
+    if (count := len(np.unique(values))) > 1:
+        raise DataError(
+            f"{path}: its column {name!r} numbers {count} frames; --frame-column {name} makes them a sequence"
+        )
+
+
 def require_columns(path: Path, rows: int, columns: int) -> None:
     """Raises DataError where rows hold too few numbers for a point, or so many without names that they are a picture."""
     if 3 <= columns <= MOST_UNNAMED:

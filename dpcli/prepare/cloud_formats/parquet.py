@@ -175,8 +175,8 @@ def _read_feather(path: Path) -> Any:
 
 def read_parquet(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud from a table with columns x, y and z."""
-    from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table, refuse_frames
+    from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table, refuse_frames_of_table
 
     table = ParquetTable(path)
-    refuse_frames(table)
+    refuse_frames_of_table(table)
     return cloud_of_table(table, keep)

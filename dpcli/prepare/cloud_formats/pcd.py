@@ -129,7 +129,8 @@ def _row_type(path: Path, said: dict[str, list[str]]) -> tuple[np.dtype, tuple[i
 def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Returns the columns, and how many points lie behind them, as `require_points` does."""
     names = header.kind.names or ()
-    table = TextTable(path, tuple(names), _lines(body), header.lines + 1, limit=header.points)
+    lines = body.decode("latin-1").replace("\r\n", "\n")
+    table = TextTable(path, tuple(names), lines, header.lines + 1, limit=header.points)
     values = table.columns(range(len(names)))
     beyond = require_points(path, header.points, table.rows if len(values) == header.points else len(values))
     columns, black = {}, {}
@@ -142,10 +143,6 @@ def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.nd
         black = {BLACK: 1} if name == "rgb" and kind.kind == "f" and len(column) and not column.any() else black
         columns[name] = column if packed or not whole else column.astype(kind)
     return columns, beyond | table.cut | black
-
-
-def _lines(body: bytes) -> str:
-    return body.decode("latin-1").replace("\r\n", "\n")
 
 
 def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, np.ndarray]:

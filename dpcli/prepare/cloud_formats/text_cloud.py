@@ -14,11 +14,14 @@ from dpcli.prepare.cloud_formats.cloud import (
     MOST_UNNAMED,
     Cloud,
     cloud_of_columns,
+    counts_rows,
     named_axes,
+    refuse_frames,
     refuse_times,
     require_columns,
     require_names,
     unnamed_columns,
+    unread_columns,
     without,
 )
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
@@ -55,7 +58,7 @@ def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if not table.names:
         names = _IMPLIED.get((path.suffix.lower(), table.width), "")
         table = replace(table, names=tuple(names.split()))
-    refuse_frames(table)
+    refuse_frames_of_table(table)
     _refuse_marked_frames(table)
     cloud = cloud_of_table(table, keep)
     counting = _counting_column(table, cloud.unread)
@@ -126,8 +129,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
         refuse_times(table.path, values)
         first = _first_axis(table, values)
-        counted = ("column 1 (no name, numbers of the rows)",) if first else ()
-        unread = counted + unnamed_columns(first + 4, table.width)
+        unread = unread_columns(first, table.width)
         return Cloud(values[:, first : first + 3], unit=table.unit, unread=unread, dropped=table.cut)
     axes = named_axes(table.path, table.names)
     if axes is None:
@@ -154,8 +156,7 @@ def _first_axis(table: TextTable, values: np.ndarray) -> int:
     ids = values[:, :whole]
     if (ids < 0).any() or (ids != np.floor(ids)).any():
         return 0
-    start = ids[0, 0]
-    if whole == 1 and len(ids) > 2 and start in (0, 1) and np.array_equal(ids[:, 0], np.arange(len(ids)) + start):
+    if whole == 1 and counts_rows(ids[:, 0]):
         return 1
     if len(ids) < (_TELLING if whole == 1 else 3):
         return 0
@@ -194,16 +195,11 @@ def _counting_column(table: TextTable, unread: Sequence[str]) -> str:
     return ""
 
 
-def refuse_frames(table: TextTable) -> None:
-    """Raises DataError when a column numbers several frames, which one cloud would mix up."""
-    name = find_frame_column(table.names)
-    if name is None or name in ("x", "y", "z"):
-        return
-    try:
-        count = len(np.unique(table.columns([table.names.index(name)])))
-    except DataError:
-        return  # words, such as the names of pictures
-    if count > 1:
-        raise DataError(
-            f"{table.path}: its column {name!r} numbers {count} frames; --frame-column {name} makes them a sequence"
-        )
+def refuse_frames_of_table(table: TextTable) -> None:
+    """Raises DataError when a column numbers several frames; one of words, such as the names of pictures, doesn't."""
+    if name := find_frame_column(table.names):
+        try:
+            values = table.columns([table.names.index(name)])
+        except DataError:
+            return
+        refuse_frames(table.path, name, values)

@@ -42,16 +42,7 @@ _SCALE = re.compile(  # a key of the depth scale without what is no letter, and 
     r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
     r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
 )
-_LENS = (
-    "coeffs",
-    "distortion_coefficients",
-    "distortion_coeffs",
-    "d",
-    "dist_coeffs",
-    "distcoeffs",
-    "distortion",
-    "disto",
-)
+_LENS = tuple("coeffs distortion_coefficients distortion_coeffs d dist_coeffs distcoeffs distortion disto".split())
 _TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenCV's order
 _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")

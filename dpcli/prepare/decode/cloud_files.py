@@ -16,7 +16,7 @@ from dpcli.prepare.cloud_formats.ply import read_ply
 from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text, read_vertices
 from dpcli.prepare.decode.e57_files import read_e57
-from dpcli.runtime.clips.other_files import stand_in
+from dpcli.runtime.clips.other_files import stand_ins_named
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".ply": read_ply,
@@ -56,19 +56,14 @@ def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] =
     """
     if path.stat().st_size == 0:
         raise DataError(f"{path}: the file is empty")
-    try:
-        return _read(path, bin_columns, keep)
-    except DataError as error:
-        raise (stand_in(path) or error) from None
-
-
-def _read(path: Path, bin_columns: int | None, keep: Sequence[str]) -> Cloud:
-    if path.suffix.lower() in MESHES:
-        return read_vertices(path, keep)
-    if path.suffix.lower() in HDF5:
-        return read_mat(path, keep)
-    if path.suffix.lower() != ".bin":
-        return _READERS[path.suffix.lower()](path, keep)
-    if keep:
-        raise DataError(f"{path}: column {keep[0]}: the columns of a .bin have no names")
-    return read_bin(path, bin_columns or guess_bin_columns([path])[0])
+    suffix = path.suffix.lower()
+    with stand_ins_named(path):
+        if suffix in MESHES:
+            return read_vertices(path, keep)
+        if suffix in HDF5:
+            return read_mat(path, keep)
+        if suffix != ".bin":
+            return _READERS[suffix](path, keep)
+        if keep:
+            raise DataError(f"{path}: column {keep[0]}: the columns of a .bin have no names")
+        return read_bin(path, bin_columns or guess_bin_columns([path])[0])

@@ -33,17 +33,7 @@ from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
-PICTURE_FOLDERS = {
-    "ref",
-    "rgba",
-    "rgb",
-    "images",
-    "image",
-    "img",
-    "imgs",
-    "frames",
-    "color",
-}  # names that say nothing else
+PICTURE_FOLDERS = set("ref rgba rgb images image img imgs frames color".split())  # names that say nothing else
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 

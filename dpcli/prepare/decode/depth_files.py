@@ -25,7 +25,7 @@ from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, joined_videos, promised_frames
 from dpcli.runtime.clips.cropping import margins
-from dpcli.runtime.clips.other_files import stand_in
+from dpcli.runtime.clips.other_files import stand_ins_named
 from dpcli.store.schema import METERS
 
 if TYPE_CHECKING:
@@ -298,19 +298,13 @@ def has_white_at_zero(data: bytes) -> bool:
 
 def read_frame(path: Path) -> np.ndarray:
     """Reads one frame (H,W) of a folder: an image, or an array in ``.npy`` or ``.npz``."""
-    try:
-        return _frame(path)
-    except DataError as error:
-        raise (stand_in(path) or error) from None
-
-
-def _frame(path: Path) -> np.ndarray:
-    if path.suffix.lower() not in ARRAY_SUFFIXES:
-        return read_image(path)
-    array = read_array(path)
-    if len(array) != 1:
-        raise DataError(f"{path}: holds {len(array)} frames; expected one (height, width), as its neighbors have")
-    return array[0]
+    with stand_ins_named(path):
+        if path.suffix.lower() not in ARRAY_SUFFIXES:
+            return read_image(path)
+        array = read_array(path)
+        if len(array) != 1:
+            raise DataError(f"{path}: holds {len(array)} frames; expected one (height, width), as its neighbors have")
+        return array[0]
 
 
 def read_frames(series: Series, stride: int = 1) -> np.ndarray:
@@ -461,10 +455,8 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         if bits < 16 and video.frames.max(initial=0) >= 1 << bits:
             video.notes[SPREAD.format(bits)] = 1
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
-        try:
+        with stand_ins_named(path):
             video = _read_file(path, stride)
-        except DataError as error:
-            raise (stand_in(path) or error) from None
     else:
         kinds = ", ".join((*ARRAY_SUFFIXES, *VIDEO_SUFFIXES))
         raise DataError(f"{path}: unknown kind; expected a folder of images, or one of {kinds}")

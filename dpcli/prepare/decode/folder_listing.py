@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.path_names import as_utf8
 from dpcli.prepare.series import is_hidden
 from dpcli.regular_files import why_unreadable
 
@@ -55,6 +56,18 @@ def files_below(root: Path) -> list[Path]:
     return sorted(
         Path(folder, name) for folder, _, names in walk_folders(root) for name in names if not is_hidden(name)
     )
+
+
+def named_below(root: Path, paths: Sequence[Path], kind: str) -> dict[str, Path]:
+    """Returns some files below a folder by their paths from there without the suffix. Raises DataError where two of them differ
+    in that alone; kind: what they are called.
+    """
+    named = {as_utf8(path.relative_to(root).with_suffix("").as_posix()): path for path in paths}
+    if len(named) < len(paths):
+        shown = {*named.values()}
+        twin = next(path for path in paths if path not in shown)
+        raise DataError(f"{twin}: there is a {kind} of the same name in another format; keep one of them")
+    return named
 
 
 def calibrations_below(root: Path) -> list[str]:

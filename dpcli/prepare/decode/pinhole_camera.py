@@ -57,10 +57,9 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
     rays = np.ones((height, width, 3), np.float32)
     if isinstance(intrinsics, LensIntrinsics):
         rays[..., :2] = _straightened(x, y, intrinsics.distortion)
-        rays.setflags(write=False)
-        return rays.reshape(-1, 3)
-    rays[..., 0] = x
-    rays[..., 1] = y[:, None]
+    else:
+        rays[..., 0] = x
+        rays[..., 1] = y[:, None]
     rays.setflags(write=False)
     return rays.reshape(-1, 3)
 

@@ -89,15 +89,18 @@ class AnimatedMesh:
         clear = np.array([material.is_clear for material in self.materials], bool)
         return np.where(clear[self.material], 0.0, area) if clear.any() else area
 
+    def shown(self) -> np.ndarray:
+        """Returns bool (T,F): whether a triangle shows something in a frame, above 1/10,000 of its largest area in the clip."""
+        areas = np.stack([self.areas(frame) for frame in range(self.num_frames)])
+        return areas > SHRUNK**2 * areas.max(0)
+
     def seen_corners(self) -> np.ndarray:
         """Returns bool (T,V): whether a vertex is a corner of a triangle that shows something in a frame.
 
         What is shrunk to nothing then, is never seen or has no area doesn't count, nor do vertices without triangles.
         """
-        areas = np.stack([self.areas(frame) for frame in range(self.num_frames)])
-        shown = areas > SHRUNK**2 * areas.max(0)
         seen = np.zeros(self.positions.shape[:2], bool)
-        for frame, triangles in enumerate(shown):
+        for frame, triangles in enumerate(self.shown()):
             seen[frame, self.triangles[triangles]] = True
         return seen
 

@@ -25,8 +25,7 @@ def choose_points(mesh: AnimatedMesh, count: int, rng: np.random.Generator) -> S
 
 def hidden_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
     """Returns bool (T,M): in which frames a point's triangle is shrunk to nothing, below 1/10,000 of its largest area."""
-    areas = np.stack([mesh.areas(frame)[points.triangle] for frame in range(mesh.num_frames)])
-    return areas < SHRUNK**2 * areas.max(0)
+    return ~mesh.shown()[:, points.triangle]
 
 
 def track_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.prepare.meshes.animated_mesh import SHRUNK, AnimatedMesh
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.gltf_extensions import decompress, instances
 from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
@@ -187,10 +187,8 @@ def _sizes(piece: _Piece, poses: np.ndarray) -> np.ndarray:
 
 def _has_twin(mesh: AnimatedMesh) -> np.ndarray:
     """Returns bool (F): which triangles lie on another one, as exporters write a leaf that is seen from both sides."""
-    areas = np.stack([mesh.areas(frame) for frame in range(mesh.num_frames)])
-    # the first frame: while hidden, all of a piece lie on one point
-    shown = (areas > SHRUNK**2 * areas.max(0)).argmax(0)
-    corners = mesh.positions[shown[:, None], mesh.triangles].astype(np.float64)
+    first = mesh.shown().argmax(0)  # while hidden, all of a piece lie on one point
+    corners = mesh.positions[first[:, None], mesh.triangles].astype(np.float64)
     grid = max(float(np.ptp(corners)), 1e-30) * 1e-6
     middles = np.rint(np.concatenate([corners.mean(1), corners.min(1), corners.max(1)], axis=1) / grid)
     _, inverse, counts = np.unique(middles, axis=0, return_inverse=True, return_counts=True)

@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
-from dpcli.prepare.cloud_formats.ply import read_header
+from dpcli.prepare.cloud_formats.ply import Element, read_header
 from dpcli.prepare.meshes.gltf import read_gltf, well_formed
 from dpcli.prepare.meshes.gltf_extensions import refuse_required
 from dpcli.prepare.meshes.gltf_mesh import shape_at_rest
@@ -47,25 +47,14 @@ _SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
 
 
-def require_counts(path: Path) -> None:
-    """Raises DataError where an OFF, STL or PLY file holds fewer or more rows than its header counts, or lacks its end mark.
-
-    Other formats count nothing (OBJ), or their reader does it (glTF, binary PLY, DAE).
-    """
-    check = _CHECKS.get(path.suffix.lower())
-    if check is not None:
-        check(path)
-
-
 def load_mesh(path: Path, root: Path | None) -> Any:
     """Returns the trimesh.Trimesh of a file, as it stands in it; root: the folder that files which it names must lie in, None
     for any.
 
-    Raises DataError where it is an archive or the like, where its counts are wrong or it has polygons that can't be read, and
-    whatever trimesh does on a damaged one.
+    Raises DataError where it is an archive or the like, where an OFF, STL or PLY holds fewer or more rows than its header counts
+    or lacks its end mark, or it has polygons that can't be read, and whatever trimesh does on a damaged one.
     """
     refuse_wrapped(path)
-    require_counts(path)
     mesh = _READERS.get(path.suffix.lower(), _by_trimesh)(path, root)
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
         raise ValueError(_NO_VERTEX)
@@ -94,12 +83,14 @@ def _read_obj(path: Path, root: Path | None) -> Any:
 
 def _read_stl(path: Path, root: Path | None) -> Any:
     data = path.read_bytes()
+    _check_stl(path, data)
     return _by_trimesh(path, root, file_obj=BytesIO(data[: _end_of_stl(data) or None]), file_type="stl")
 
 
 def _read_ply(path: Path, root: Path | None) -> Any:
     with path.open("rb") as file:
-        _, elements = read_header(path, file)
+        order, elements = read_header(path, file)
+        _check_ply(path, elements, None if order else file)
     faces = sum(element.count for element in elements if element.name == "face")
     if faces > (size := path.stat().st_size):
         raise DataError(
@@ -114,6 +105,10 @@ def _read_ply(path: Path, root: Path | None) -> Any:
 
 def _read_off(path: Path, root: Path | None) -> Any:
     counts, rows = _off_rows(path)
+    if counts:
+        _compare(path, "vertices and faces", sum(counts), len(rows))
+        if counts[1]:
+            _require_corners(path, rows[-1])
     mesh = _by_trimesh(path, root)
     return mesh if not rows or len(mesh.faces) == counts[1] else _mesh_of(_of_off(counts[0], rows))
 
@@ -325,16 +320,7 @@ def _off_rows(path: Path) -> tuple[list[int], list[bytes]]:
     return ([int(number) for number in numbers], rows) if known else ([], [])
 
 
-def _check_off(path: Path) -> None:
-    counts, rows = _off_rows(path)
-    if counts:
-        _compare(path, "vertices and faces", sum(counts), len(rows))
-        if counts[1]:
-            _require_corners(path, rows[-1])
-
-
-def _check_stl(path: Path) -> None:
-    data = path.read_bytes()
+def _check_stl(path: Path, data: bytes) -> None:
     count = int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little")
     if len(data) in (0, _STL_HEAD + count * _STL_FACE):
         return
@@ -352,21 +338,21 @@ def _check_stl(path: Path) -> None:
         )
 
 
-def _check_ply(path: Path) -> None:
-    with path.open("rb") as file:
-        order, elements = read_header(path, file)
-        if any(element.name == "tristrips" and element.count for element in elements):
-            raise DataError(
-                f"{path}: its faces are strips of triangles (tristrips), which are not read; export it as triangles"
-            )
-        if not order:
-            rows = [line for line in file if line.strip()]
-            _compare(path, "rows", sum(element.count for element in elements if element.properties), len(rows))
-            if rows and elements[-1].properties[:1] and not elements[-1].properties[0][1]:
-                _require_corners(path, rows[-1])
+def _check_ply(path: Path, elements: list[Element], file: BinaryIO | None) -> None:
+    """Raises DataError for faces that aren't read, and where a text holds other rows than its header counts. file: that of a text,
+    behind its header.
+    """
+    if any(element.name == "tristrips" and element.count for element in elements):
+        raise DataError(
+            f"{path}: its faces are strips of triangles (tristrips), which are not read; export it as triangles"
+        )
+    if file is not None:
+        rows = [line for line in file if line.strip()]
+        _compare(path, "rows", sum(element.count for element in elements if element.properties), len(rows))
+        if rows and elements[-1].properties[:1] and not elements[-1].properties[0][1]:
+            _require_corners(path, rows[-1])
 
 
-_CHECKS: dict[str, Callable[[Path], None]] = {".off": _check_off, ".stl": _check_stl, ".ply": _check_ply}
 _READERS: dict[str, Callable[[Path, Path | None], Any]] = {
     **{".obj": _read_obj, ".stl": _read_stl, ".ply": _read_ply, ".off": _read_off, ".dae": _read_dae},
     **{".glb": _read_gltf, ".gltf": _read_gltf},

@@ -31,20 +31,16 @@ class Curve:
         """
         cubic = self.interpolation == "CUBICSPLINE"
         time = np.clip(np.asarray(time, np.float64), self.times[0], self.times[-1])
-        if len(self.times) == 1:
-            found = np.repeat(self.values[:, 1] if cubic else self.values, len(time), axis=0)
-            return normalize(found) if self.rotation else found
         at_key = np.searchsorted(self.times, time + _ROUNDING * np.abs(self.times).max(), side="right") - 1
-        if self.interpolation == "STEP":
-            found = self.values[at_key]
+        if len(self.times) == 1 or self.interpolation == "STEP":
+            found = (self.values[:, 1] if cubic else self.values)[at_key]
             return normalize(found) if self.rotation else found
         k = np.clip(at_key, 0, len(self.times) - 2)
-        step = self.times[k + 1] - self.times[k]
+        first, last, step = self.values[k], self.values[k + 1], self.times[k + 1] - self.times[k]
         s = np.where(step > 0, (time - self.times[k]) / np.where(step > 0, step, 1), 1).clip(0)[:, None]
         if cubic:
-            found = _hermite(self.values[k], self.values[k + 1], step[:, None], s)
+            found = _hermite(first, last, step[:, None], s)
             return normalize(found) if self.rotation else found
-        first, last = self.values[k], self.values[k + 1]
         return slerp(first, last, s) if self.rotation else first + s * (last - first)
 
 

@@ -16,7 +16,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
-from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
@@ -97,9 +97,15 @@ class OwnScans:
             raise UsageError("--scale and --fps must be more than 0")
         Lengths(self.scale, self.unit)
 
+    def _in_folders(self) -> tuple[list[str], str]:
+        """Returns what `labels_of_folders` takes: the names of the samples, and what each holds at least."""
+        raise NotImplementedError
+
     @cached_property
-    def _table(self) -> LabelTable | None:
-        return read_labels(self.labels) if self.labels else None
+    def _table(self) -> LabelTable:
+        if self.label_from_folder:
+            return labels_of_folders(self.raw, *self._in_folders())
+        return read_labels(self.labels) if self.labels else LabelTable()
 
     def fields_beside(self, *, time: object, color: object) -> tuple[str, ...]:
         """Returns the optional fields that every sample has, given whether all have times, and colors."""
@@ -109,7 +115,7 @@ class OwnScans:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return self._table.class_names if self._table else []
+        return self._table.class_names
 
     @property
     def length_unit(self) -> str:
@@ -134,12 +140,14 @@ def assemble(
     notes = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter(clean(clouds))))
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
-    divisor, converted = lengths.divisor([clouds[t] for t in kept])
-    crowded = any(is_crowded(clouds[t].points) for t in kept[:: -(-len(kept) // _JUDGED)])  # the fullest has no padding
+    filled = [clouds[t] for t in kept]
+    divisor, converted = lengths.divisor(filled)
+    # the fullest has no padding
+    crowded = any(is_crowded(cloud.points) for cloud in filled[:: -(-len(filled) // _JUDGED)])
     notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
-    if not color and (colored := sum(clouds[t].color is not None for t in kept)):
+    if not color and (colored := sum(cloud.color is not None for cloud in filled)):
         notes[UNREAD_COLORS] = colored
-    frames = [clouds[t].points for t in kept]
+    frames = [cloud.points for cloud in filled]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor
     points, shift = _joined(frames, divisor, ends)
@@ -148,9 +156,9 @@ def assemble(
     notes |= _rounded(frames, each, divisor, _COARSE if lengths.unit == "m" else np.inf)
     if lengths.unit == "m":
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
-    notes |= _further([clouds[t] for t in kept], item.extra["unread"]) if "unread" in item.extra else {}
+    notes |= _further(filled, item.extra["unread"]) if "unread" in item.extra else {}
     extra = {
-        kept_name(name): np.concatenate([as_float32(item.path, name, clouds[t].extra[name]) for t in kept])
+        kept_name(name): np.concatenate([as_float32(item.path, name, cloud.extra[name]) for cloud in filled])
         for name in clouds[0].extra
     }
     sequence = CloudSequence(
@@ -158,13 +166,13 @@ def assemble(
         points,
         offsets(counts[kept]),
         time=None if time is None else time[kept],
-        color=_colors(item, [clouds[t] for t in kept]) if color else None,
-        track=_tracks(item, [clouds[t] for t in kept]),
+        color=_colors(item, filled) if color else None,
+        track=_tracks(item, filled),
         shift=shift,
         extra=extra,
         **describe(item),
     )
-    notes |= {SCATTERED: 1} if _scatters([clouds[t] for t in kept]) else {}
+    notes |= {SCATTERED: 1} if _scatters(filled) else {}
     return Sample(sequence, notes)
 
 

@@ -15,7 +15,6 @@ from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
-from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
@@ -50,12 +49,9 @@ class CloudFolders(OwnScans):
         """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in super().config.items() if k != "pattern" or self.pattern}
 
-    @cached_property
-    def _table(self) -> LabelTable | None:
-        if self.label_from_folder:
-            layout = "CLASS/SEQUENCE" if len({len(path.parts) for path in self._relative}) > 1 else "CLASS"
-            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], layout)
-        return read_labels(self.labels) if self.labels else None
+    def _in_folders(self) -> tuple[list[str], str]:
+        layout = "CLASS/SEQUENCE" if len({len(path.parts) for path in self._relative}) > 1 else "CLASS"
+        return [as_utf8(path.as_posix()) for path in self._relative], layout
 
     @cached_property
     def _series(self) -> list[Series]:
@@ -96,7 +92,7 @@ class CloudFolders(OwnScans):
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, series.folder, extra={**told, "series": series}))
-        return self._with_labels(items) if self._table else items
+        return self._with_labels(items)
 
     def _with_labels(self, items: list[Item]) -> list[Item]:
         """Returns items with what the table says of them. Raises DataError when it names a stranger, and says so where the names
@@ -151,7 +147,7 @@ class CloudFolders(OwnScans):
                 " put it into a folder of its own (CLASS/SEQUENCE/frames), or give --frame-column where it is a table of frames"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items])
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:

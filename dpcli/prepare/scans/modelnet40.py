@@ -18,47 +18,10 @@ from dpcli.store import CloudSequence
 from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
 
-CLASS_NAMES = (
-    "airplane",
-    "bathtub",
-    "bed",
-    "bench",
-    "bookshelf",
-    "bottle",
-    "bowl",
-    "car",
-    "chair",
-    "cone",
-    "cup",
-    "curtain",
-    "desk",
-    "door",
-    "dresser",
-    "flower_pot",
-    "glass_box",
-    "guitar",
-    "keyboard",
-    "lamp",
-    "laptop",
-    "mantel",
-    "monitor",
-    "night_stand",
-    "person",
-    "piano",
-    "plant",
-    "radio",
-    "range_hood",
-    "sink",
-    "sofa",
-    "stairs",
-    "stool",
-    "table",
-    "tent",
-    "toilet",
-    "tv_stand",
-    "vase",
-    "wardrobe",
-    "xbox",
+CLASS_NAMES = tuple(
+    "airplane bathtub bed bench bookshelf bottle bowl car chair cone cup curtain desk door dresser flower_pot"
+    " glass_box guitar keyboard lamp laptop mantel monitor night_stand person piano plant radio range_hood sink"
+    " sofa stairs stool table tent toilet tv_stand vase wardrobe xbox".split()
 )
 PUBLISHED = {"train": 9840, "test": 2468}
 _FILE = re.compile(r"ply_data_(train|test)(\d+)\.h5")
@@ -101,6 +64,7 @@ class ModelNet40:
     raw: Path
     length_unit: ClassVar[str] = "unit sphere"
     fields: ClassVar[tuple[str, ...]] = ()
+    config: ClassVar[dict[str, Any]] = {}
 
     @property
     def class_names(self) -> list[str]:
@@ -112,11 +76,6 @@ class ModelNet40:
         if len(names) != len(CLASS_NAMES) or len(set(names)) != len(names):
             raise DataError(f"{path}: {len(names)} names, {len(set(names))} of them different; expected 40")
         return names
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {}
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""

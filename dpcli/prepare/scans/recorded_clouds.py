@@ -12,7 +12,6 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.cloud import without
-from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample
 from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, open_recording, unread_recordings
@@ -47,11 +46,8 @@ class RecordedClouds(OwnScans):
             raise DataError(f"{self.raw}: no recording in it; expected .bag, .mcap, .db3, or folders of ROS 2 bags")
         return {as_utf8(p.relative_to(self.raw).as_posix() if p != self.raw else p.name): p for p in found}
 
-    @cached_property
-    def _table(self) -> LabelTable | None:
-        if self.label_from_folder:
-            return labels_of_folders(self.raw, list(self._names), "CLASS/RECORDING")
-        return read_labels(self.labels) if self.labels else None
+    def _in_folders(self) -> tuple[list[str], str]:
+        return list(self._names), "CLASS/RECORDING"
 
     @property
     def _read(self) -> tuple[str, ...]:
@@ -76,7 +72,7 @@ class RecordedClouds(OwnScans):
         """Returns the index in its final order. Raises DataError when there is no recording."""
         color, unread = self._first
         items = [Item(name, path, extra={"color": color, "unread": unread}) for name, path in self._names.items()]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -102,4 +98,4 @@ class RecordedClouds(OwnScans):
             lines.append(
                 f"left out, not .bag, .mcap or .db3: {first_names(others, _LISTED)}; unpack or finish them first"
             )
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)

@@ -24,8 +24,7 @@ from dpcli.prepare.cloud_formats.column_names import (
 from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import EMPTY, cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
-from dpcli.prepare.decode.folder_listing import walk_folders
-from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
+from dpcli.prepare.decode.folder_listing import named_below, walk_folders
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
@@ -88,12 +87,7 @@ class TableSequences(OwnScans):
         found = found or [path for path in _tables_below(self.raw, SUFFIXES) if not made_by_dpc(path)]
         if not found:
             raise DataError(f"{self.raw}: no tables ({', '.join((*TABLES, *SUFFIXES))})")
-        named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in found}
-        if len(named) < len(found):
-            shown = {*named.values()}
-            twins = next(path for path in found if path not in shown)
-            raise DataError(f"{twins}: there is a table of the same name in another format; keep one of them")
-        return named
+        return named_below(self.raw, found, "table")
 
     @cached_property
     def _found(self) -> tuple[bool, bool]:
@@ -107,12 +101,8 @@ class TableSequences(OwnScans):
             return loaded.cloud.color is not None, timed
         return False, bool(self.fps)
 
-    @cached_property
-    def _table(self) -> LabelTable | None:
-        if self.labels:
-            return read_labels(self.labels)
-        names = [item.name for item in self._items]
-        return labels_of_folders(self.raw, names, "CLASS/TABLE") if self.label_from_folder else None
+    def _in_folders(self) -> tuple[list[str], str]:
+        return [item.name for item in self._items], "CLASS/TABLE"
 
     @cached_property
     def _items(self) -> list[Item]:
@@ -131,19 +121,11 @@ class TableSequences(OwnScans):
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        return self._table.apply(self._items) if self._table else self._items
+        return self._table.apply(self._items)
 
     def _load(self, path: Path) -> Loaded:
         facts = path.stat()
-        return _load(
-            path,
-            (facts.st_size, facts.st_mtime_ns),
-            self.frame_column,
-            self.sequence_column,
-            self.gap,
-            self.keep,
-            self.track,
-        )
+        return _load(self, path, facts.st_size, facts.st_mtime_ns)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -200,7 +182,7 @@ class TableSequences(OwnScans):
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
         read = {path.suffix.lower() for path in self._paths.values()}
         lines += left_out_below(self.raw, (*TABLES, *read))
-        return lines + (self._table.unnamed(items) if self._table else [])
+        return lines + self._table.unnamed(items)
 
 
 @dataclass(frozen=True)
@@ -233,44 +215,35 @@ class Loaded:
 
     def frames(self, part: Rows) -> list[Cloud]:
         """Returns the frames of one sequence."""
-        found = []
-        for start, stop in zip(part.offsets[:-1], part.offsets[1:]):
-            rows = part.rows[start:stop]
-            color = None if self.cloud.color is None else self.cloud.color[rows]
-            extra = {name: values[rows] for name, values in self.cloud.extra.items()}
-            track = None if self.cloud.track is None else self.cloud.track[rows]
-            found.append(Cloud(self.cloud.points[rows], color, self.cloud.unit, extra, track=track))
+        found = [replace(self.cloud, dropped={}) for _ in part.offsets[1:]]
+        for frame, start, stop in zip(found, part.offsets[:-1], part.offsets[1:]):
+            frame.keep(part.rows[start:stop])
         return found
 
 
 @lru_cache(maxsize=2)  # a table holds many sequences; each process reads it once
-def _load(
-    path: Path,
-    facts: tuple[int, int],
-    wanted: str,
-    sequences: str,
-    gap: float | None,
-    keep: tuple[str, ...],
-    track: str,
-) -> Loaded:
-    if not facts[0]:
+def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loaded:
+    if not size:
         raise DataError(f"{path}: the file is empty")
+    in_columns = reader.track == COLUMNS
     try:
-        wide = read_wide(path) if track == COLUMNS else None
+        wide = read_wide(path) if in_columns else None
         table = wide.table if wide else _open_table(path)
-        rows_count = wide is not None and not (wanted or sequences or gap or find_frame_column(table.names))
-        column = "" if rows_count else frame_column(table, wanted)
-        cloud = wide.cloud(keep) if wide else cloud_of_table(table, keep)
+        told = reader.frame_column or reader.sequence_column or reader.gap or find_frame_column(table.names)
+        rows_count = wide is not None and not told
+        column = "" if rows_count else frame_column(table, reader.frame_column)
+        cloud = wide.cloud(reader.keep) if wide else cloud_of_table(table, reader.keep)
     except DataError as error:
-        raise (stand_in(path) or (error if track == COLUMNS else hint(path, error))) from None
+        raise (stand_in(path) or (error if in_columns else hint(path, error))) from None
     if isinstance(table, TextTable) and (empty := table.empty_rows):
         cloud.dropped = {**cloud.dropped, EMPTY: empty}
-    cloud.track = name_rows(table, track) if track not in ("", ROWS, COLUMNS) else cloud.track
-    axes = cloud.columns
-    unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    named = [] if sequences else find_recording_columns(unused)
+    if reader.track not in ("", ROWS, COLUMNS):
+        cloud.track = name_rows(table, reader.track)
+    apart = {*cloud.columns, column, reader.sequence_column}
+    unused = tuple(name for name in table.names if name and name not in apart)
+    named = [] if reader.sequence_column else find_recording_columns(unused)
     recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
-    parts = wide.rows() if wide and rows_count else split_rows(table, column, sequences, gap)
+    parts = wide.rows() if rows_count else split_rows(table, column, reader.sequence_column, reader.gap)
     clocks = find_clocks(table, unused)
     if wide:
         parts, points = [wide.spread(part) for part in parts], len(wide.trios)

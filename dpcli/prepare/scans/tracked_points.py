@@ -153,7 +153,7 @@ class TrackedViews(OwnScans):
                     " scene of them, and `dpc generate4d export --as clouds` its clouds"
                 )
             items = [Item(as_utf8(views.header.name), self.raw)]
-        return self._table.apply(items) if self._table else items
+        return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample. Raises DataError when its data are bad."""

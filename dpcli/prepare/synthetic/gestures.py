@@ -15,11 +15,10 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import UsageError
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.reader import Item, Sample, sample_of_frames
 from dpcli.prepare.synthetic.human_figure import Figure, capsules
 from dpcli.prepare.synthetic.virtual_depth_camera import add_noise, render
 from dpcli.runtime.seeds import PrepareStream, generator
-from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
     "raise arm",
@@ -107,6 +106,7 @@ class SyntheticGestures:
     noise: float = 1.0
     seed: int = 0
     length_unit: ClassVar[str] = "m"
+    class_names: ClassVar[tuple[str, ...]] = CLASS_NAMES
     fields: ClassVar[tuple[str, ...]] = ("time", "part")
 
     def __post_init__(self) -> None:
@@ -114,11 +114,6 @@ class SyntheticGestures:
             value = getattr(self, option)
             if value < least:
                 raise UsageError(f"--{option.replace('_', '-')} {value}: expected {least} or more")
-
-    @property
-    def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return list(CLASS_NAMES)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -164,16 +159,8 @@ class SyntheticGestures:
             points.append(rays[seen] * z[:, None])
             parts.append(part.reshape(-1)[seen])
         counts = np.array([len(p) for p in points], np.int64)
-        kept, notes = drop_empty_frames(item.name, counts)
-        sequence = CloudSequence(
-            item.name,
-            np.concatenate(points),
-            offsets(counts[kept]),
-            time=kept / FRAME_RATE,
-            part=np.concatenate(parts),
-            **describe(item),
-        )
-        return Sample(sequence, notes)
+        time = np.arange(len(counts)) / FRAME_RATE
+        return sample_of_frames(item, np.concatenate(points), counts, {}, time=time, part=np.concatenate(parts))
 
     def _animate(self, subject: _Subject, label: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Returns axes of all capsules in camera axes, f64 (T,parts,3) each."""

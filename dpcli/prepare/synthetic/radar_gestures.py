@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.reader import Item, Sample, sample_of_frames
 from dpcli.prepare.synthetic.gestures import FRAME_RATE, SyntheticGestures, direction, time_warp, to_camera, wrist_path
 from dpcli.prepare.synthetic.human_figure import PARTS, Figure, capsules
 from dpcli.runtime.seeds import PrepareStream, generator
-from dpcli.store import CloudSequence
 from dpcli.store.schema import kept_name
 
 MOST_POINTS = 64  # of a frame, as the firmware of common chips sends at most
@@ -74,17 +73,11 @@ class RadarGestures(SyntheticGestures):
         starts, ends = animate(subject, item.label, self.frames, rng)
         fan = rng.uniform([-2, -0.5, 2], [2, 1, 6])  # something in the room that moves in its place
         frames = [self._frame(subject, starts, ends, t, fan, rng) for t in range(len(starts))]
-        kept, notes = drop_empty_frames(item.name, np.array([len(frame) for frame in frames], np.int64))
+        counts = np.array([len(frame) for frame in frames], np.int64)
         rows = np.concatenate(frames).astype(np.float32)
-        sequence = CloudSequence(
-            item.name,
-            rows[:, :3].copy(),
-            offsets(np.array([len(frames[t]) for t in kept])),
-            time=kept / FRAME_RATE,
-            extra={DOPPLER: rows[:, 3].copy(), INTENSITY: rows[:, 4].copy()},
-            **describe(item),
-        )
-        return Sample(sequence, notes)
+        extra = {DOPPLER: rows[:, 3].copy(), INTENSITY: rows[:, 4].copy()}
+        time = np.arange(len(frames)) / FRAME_RATE
+        return sample_of_frames(item, rows[:, :3].copy(), counts, {}, time=time, extra=extra)
 
     def _frame(
         self,

@@ -42,18 +42,11 @@ def _faces(inside: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Makes of every grid edge that crosses the surface a quad of the four cells around it."""
     triangles = []
     for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        first, last = (
-            np.take(inside, range(inside.shape[axis] - 1), axis),
-            np.take(inside, range(1, inside.shape[axis]), axis),
-        )
-        edge = np.argwhere(first != last)
-        edge = edge[
-            (edge[:, u] > 0)
-            & (edge[:, v] > 0)
-            & (edge[:, u] < inside.shape[u] - 1)
-            & (edge[:, v] < inside.shape[v] - 1)
-        ]
+        u, v = across = [(axis + 1) % 3, (axis + 2) % 3]
+        step = np.diff(inside.astype(np.int8), axis=axis)  # -1: the edge leads out
+        edge = np.argwhere(step)
+        last = np.array(inside.shape)[across] - 1
+        edge = edge[((edge[:, across] > 0) & (edge[:, across] < last)).all(1)]
         ring = []
         for du, dv in ((-1, -1), (0, -1), (0, 0), (-1, 0)):  # anticlockwise seen from the end of the axis
             cell = edge.copy()
@@ -61,7 +54,7 @@ def _faces(inside: np.ndarray, number: np.ndarray) -> np.ndarray:
             cell[:, v] += dv
             ring.append(number[tuple(cell.T)])
         quad = np.stack(ring, axis=1)
-        leaves = first[tuple(edge.T)]  # inside first: the outside lies along the axis
+        leaves = step[tuple(edge.T)] < 0
         quad = np.where(leaves[:, None], quad, quad[:, ::-1])
         triangles += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
     return np.concatenate(triangles)

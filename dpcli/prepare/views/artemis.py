@@ -223,19 +223,13 @@ def _sphere(motion: Motion, frame: int, rig: Rig) -> tuple[np.ndarray, float]:
     """Returns center and radius of the object from the silhouettes of all cameras at one frame."""
     cameras, boxes = [], []
     for camera in _present(motion, frame, len(rig.poses)):
-        box = visible_box(_alpha(motion, frame, camera))
+        box = visible_box(read_mask(motion.alpha(frame, camera)))
         if box is not None:
             cameras.append(camera)
             boxes.append(box)
     if not boxes:
         raise DataError(f"{motion.folders[frame]}: no object in any camera's alpha")
     return sphere_of_silhouettes(rig.intrinsics[cameras], rig.poses[cameras], boxes)
-
-
-def _alpha(motion: Motion, frame: int, camera: int) -> np.ndarray:
-    """Returns u8 (H,W,4) with alpha only, for boxes."""
-    alpha = read_mask(motion.alpha(frame, camera))
-    return np.dstack([np.zeros((*alpha.shape, 3), np.uint8), alpha])
 
 
 def _picture(motion: Motion, frame: int, camera: int) -> np.ndarray:
@@ -254,7 +248,7 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
             row = []
             for view in views:
                 motion.image(frame, view)
-                alpha = _alpha(motion, frame, view)
+                alpha = read_mask(motion.alpha(frame, view))
                 row.append(visible_box(alpha))
                 if row[-1] is None:
                     raise DataError(f"{motion.alpha(frame, view)}: no object, the alpha is empty")
@@ -280,7 +274,7 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
 
 def _check_tracks(motion: Motion, frame: int, view: int, rig: Rig, points: np.ndarray) -> None:
     """Warns when the skinned voxels do not project into the silhouette: then cameras or bones are of another convention."""
-    alpha = _alpha(motion, frame, view)[..., 3]
+    alpha = read_mask(motion.alpha(frame, view))
     seen = points @ rig.poses[view][:3, :3].T + rig.poses[view][:3, 3]
     pixel = seen @ rig.intrinsics[view].T
     u, v = np.floor(pixel[:, :2] / np.where(np.abs(pixel[:, 2:]) > 1e-9, pixel[:, 2:], 1)).T

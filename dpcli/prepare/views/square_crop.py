@@ -62,12 +62,12 @@ def resize(rgba: np.ndarray, size: int) -> np.ndarray:
     return result
 
 
-def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
-    """Returns the smallest box around the object, None when the picture is empty.
+def visible_box(alpha: np.ndarray, island: float = 0.0) -> Box | None:
+    """Returns the smallest box around the object in u8 (H,W), None when the picture is empty.
 
     island: pieces apart that are smaller than this share of the object don't count (leftovers of a segmentation).
     """
-    seen = rgba[..., 3] >= VISIBLE
+    seen = alpha >= VISIBLE
     if island > 0 and seen.any():
         cv2 = load_cv2()
         _, label, stats, _ = cv2.connectedComponentsWithStats(seen.astype(np.uint8), connectivity=8)
@@ -80,17 +80,17 @@ def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def pieces(rgba: np.ndarray, share: float) -> int:
-    """Returns how many pieces of the object lie apart, none smaller than this share of the largest."""
+def pieces(alpha: np.ndarray, share: float) -> int:
+    """Returns how many pieces of the object in u8 (H,W) lie apart, none smaller than this share of the largest."""
     cv2 = load_cv2()
-    _, _, stats, _ = cv2.connectedComponentsWithStats((rgba[..., 3] >= VISIBLE).astype(np.uint8), connectivity=8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats((alpha >= VISIBLE).astype(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]  # row 0 is the background
     return int((areas >= share * areas.max(initial=1)).sum())
 
 
-def touches_border(rgba: np.ndarray) -> bool:
-    """Returns whether the object runs into the picture's border, along at least a hundredth of a side."""
-    solid = rgba[..., 3] > 127
+def touches_border(alpha: np.ndarray) -> bool:
+    """Returns whether the object in u8 (H,W) runs into the picture's border, along at least a hundredth of a side."""
+    solid = alpha > 127
     runs = [solid[0].sum(), solid[-1].sum(), solid[:, 0].sum(), solid[:, -1].sum()]
     return max(runs) >= max(2, min(solid.shape) // 100)
 

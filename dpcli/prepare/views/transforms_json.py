@@ -157,7 +157,7 @@ def _look(view: View, times: list[float], options: VideoOptions) -> tuple[Box, t
         if len(sizes) > 1:
             (a, first), (b, second) = sizes.items()
             raise DataError(f"{second} is {b[0]}x{b[1]}, {first} is {a[0]}x{a[1]}; one camera has one size")
-        box = visible_box(rgba)
+        box = visible_box(rgba[..., 3])
         if box is not None:
             boxes.append(box)
     if not boxes:

@@ -206,16 +206,16 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty, apart, dark, whole = [], [], [], [], [], [], 0
     for index, rgba in zip(wanted, cutter.cut(wanted)):
-        box = visible_box(rgba, _ISLAND)
+        box = visible_box(rgba[..., 3], _ISLAND)
         if box is None:
             empty.append(index)
             continue
         boxes.append(box)
         good.append(index)
         whole += cutter.mode == "mask" and rgba[..., 3].min() > 127
-        if cutter.mode != "keep" and touches_border(rgba):
+        if cutter.mode != "keep" and touches_border(rgba[..., 3]):
             cut_off.append(index)
-        if pieces(rgba, _OBJECT) > 1:
+        if pieces(rgba[..., 3], _OBJECT) > 1:
             apart.append(index)
         if cutter.mode == "alpha" and matting.fades_to_black(rgba):
             dark.append(index)
@@ -425,6 +425,6 @@ def _given_pictures(paths: list[Path], options: VideoOptions) -> Iterator[np.nda
         if rgba.shape != shape:
             raise DataError(f"{path}: {rgba.shape[1]}x{rgba.shape[0]}, other frames of this view {shape[1]}x{shape[0]}")
         rgba = matting.cut_alone(rgba, str(path), options.background, options.tolerance, options.holes)
-        if visible_box(rgba) is None:
+        if visible_box(rgba[..., 3]) is None:
             raise DataError(f"{path}: no object in this view; generate it again or leave its view out")
         yield whole_picture(rgba.shape[1], rgba.shape[0]).apply(rgba, options.size)

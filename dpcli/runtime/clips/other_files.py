@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -86,6 +87,15 @@ def stand_in(path: Path) -> DataError | None:
     except OSError:
         return None
     return DataError(f"{path}: {what}") if what else None
+
+
+@contextmanager
+def stand_ins_named(path: Path) -> Iterator[None]:
+    """Puts the error of `stand_in`, where the file is one, in place of the DataError of whoever reads it."""
+    try:
+        yield
+    except DataError as error:
+        raise (stand_in(path) or error) from None
 
 
 def no_video(path: Path) -> str:

@@ -59,7 +59,7 @@ def test_meteornets_msr_is_what_the_raw_files_give(tmp_path):
     np.testing.assert_allclose(b.points, a.points, rtol=1e-6, atol=1e-7)
     assert (b.name, b.split, b.label, b.subject) == (a.name, a.split, a.label, a.subject) == (MSR, "test", 0, 7)
     np.testing.assert_array_equal(a.frame_offsets, b.frame_offsets)
-    assert (reader.length_unit, reader.class_names) == (raw.length_unit, raw.class_names)
+    assert (reader.length_unit, list(reader.class_names)) == (raw.length_unit, list(raw.class_names))
 
 
 @pytest.mark.parametrize("protocol", ["xsub", "xview"])

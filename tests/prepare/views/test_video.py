@@ -226,7 +226,7 @@ def test_one_crop_keeps_the_motion(tmp_path):
     for frame in range(4):
         expected = (np.array([20 + 5 * frame, 24]) - (crop.left, crop.top)) * scale
         np.testing.assert_allclose(centroid(found[0, frame]), expected, atol=0.1)
-    boxes = np.array([visible_box(picture) for picture in found.values()])
+    boxes = np.array([visible_box(picture[..., 3]) for picture in found.values()])
     assert boxes[:, 2].max() - boxes[:, 0].min() == pytest.approx(0.8 * 50, abs=2)
     whole = read(video_clip(folder, VideoOptions(size=64, recenter=False)))
     np.testing.assert_array_equal(whole[0, 2][8:56], moving(4)[2])  # 64 x 48 padded to a square, not resampled
@@ -259,9 +259,9 @@ def test_resizing_does_not_bleed_hidden_colors():
 
 def test_a_stray_piece_does_not_widen_the_crop():
     picture = disc((40, 24), 12)
-    alone = visible_box(picture, 0.01)
+    alone = visible_box(picture[..., 3], 0.01)
     picture[2:4, 2:3] = 255
-    assert visible_box(picture, 0.01) == alone != visible_box(picture)
+    assert visible_box(picture[..., 3], 0.01) == alone != visible_box(picture[..., 3])
 
 
 def write_masks(path: Path, masks: list[np.ndarray]) -> Path:
