@@ -267,11 +267,12 @@ def _load(
         cloud.dropped = {**cloud.dropped, EMPTY: empty}
     cloud.track = name_rows(table, track) if track not in ("", ROWS, COLUMNS) else cloud.track
     axes = cloud.columns
-    unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    named = [] if sequences else find_recording_columns(unused)
+    beside = table.others if isinstance(table, ArrayTable) else ()
+    unused = (*(name for name in table.names if name and name not in {*axes, column, sequences}), *beside)
+    named = [] if sequences else find_recording_columns(without(unused, beside))
     recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
     parts = wide.rows() if wide and rows_count else split_rows(table, column, sequences, gap)
-    clocks = find_clocks(table, unused)
+    clocks = find_clocks(table, without(unused, beside))
     if wide:
         parts, points = [wide.spread(part) for part in parts], len(wide.trios)
         clocks = [replace(clock, seconds=np.repeat(clock.seconds, points)) for clock in clocks]
