@@ -257,7 +257,7 @@ def _load(
         raise DataError(f"{path}: the file is empty")
     try:
         wide = read_wide(path) if track == COLUMNS else None
-        table = wide.table if wide else _open_table(path)
+        table = wide.table if wide else open_table(path)
         rows_count = wide is not None and not (wanted or sequences or gap or find_frame_column(table.names))
         column = "" if rows_count else frame_column(table, wanted)
         cloud = wide.cloud(keep) if wide else cloud_of_table(table, keep)
@@ -280,7 +280,8 @@ def _load(
     return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
-def _open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+def open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+    """Returns the table in a file of any format. Raises DataError where it holds none."""
     suffix = path.suffix.lower()
     return (
         ArrayTable(path) if suffix in SUFFIXES else ParquetTable(path) if suffix in COLUMNAR else read_text_table(path)
