@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.attributes import told_beside, told_units
-from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources
+from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources, says_times
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.column_names import (
@@ -30,13 +30,14 @@ from dpcli.prepare.cloud_formats.column_names import (
 from dpcli.prepare.scans.times_of_tables import seconds_of
 
 Columns = dict[str, np.ndarray]
+Found = tuple[Columns, dict[str, str], tuple[str, ...]]  # columns, units of some, names of what lies beside them
 
 
 class ArrayTable:
     """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
 
     by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "". cut: notes of what
-    is odd about its numbers.
+    is odd about its numbers. others: the names of arrays beside it that are no columns.
 
     Raises DataError where the file holds no table, or several, or x, y and z in different units.
     """
@@ -49,7 +50,7 @@ class ArrayTable:
                 f"{path}: holds {told}; expected one: write it as .csv or .parquet (pandas: DataFrame.to_csv)"
             )
         self.path = path
-        ((self.by_name, self.units),) = found.values()
+        ((self.by_name, self.units, self.others),) = found.values()
         self.names = tuple(self.by_name)
         self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
         self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
@@ -103,21 +104,22 @@ def holds_table(path: Path) -> bool:
         return True
 
 
-def _tables_of(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
+def _tables_of(path: Path) -> dict[str, Found]:
     facts = path.stat()
     return _read_once(path, facts.st_size, facts.st_mtime_ns)
 
 
 @lru_cache(maxsize=1)  # which is asked for again when the table is opened
-def _read_once(path: Path, _size: int, _changed: int) -> dict[str, tuple[Columns, dict[str, str]]]:
-    """Returns the tables of points in a file by name: their columns (N each), and what attributes say of the units of some.
+def _read_once(path: Path, _size: int, _changed: int) -> dict[str, Found]:
+    """Returns the tables of points in a file by name: their columns (N each), what attributes say of the units of some, and
+    what lies beside them.
 
     Equally long arrays that lie side by side are one where a name says which of them numbers the frames.
     """
     found = {}
     for name, (table, kinds) in read_tables(path).items():
         columns = _columns_of(table, kinds)
-        found |= {name: (columns, {"": str(kinds.get("units", ""))})} if _are_points(columns) else {}
+        found |= {name: (columns, {"": str(kinds.get("units", ""))}, ())} if _are_points(columns) else {}
     return found or _side_by_side(path)
 
 
@@ -156,8 +158,10 @@ def _are_points(columns: Columns) -> bool:
         return True
 
 
-def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
-    """Returns the tables of arrays (N), or (N,3 and more) called points, that lie in one group of a file."""
+def _side_by_side(path: Path) -> dict[str, Found]:
+    """Returns the tables of arrays (N), or (N,3 and more) called points, that lie in one group of a file; with a time for each
+    row where an array has one for each frame.
+    """
     with open_arrays(path) as arrays:
         groups: dict[str, dict[str, Any]] = {}
         for name, one in arrays.items():
@@ -175,8 +179,24 @@ def _side_by_side(path: Path) -> dict[str, tuple[Columns, dict[str, str]]]:
             shown = {name: one if name in plain else with_gaps(one) for name, one in alike.items()}
             columns = _columns_of({name: np.asarray(one[()]).reshape(rows, -1) for name, one in shown.items()}, {})
             if columns and _are_points(columns):
-                told = {name: told_units(one) for name, one in alike.items()}
+                times = _times_of_frames(own, columns[frames])
+                columns |= times
+                told = {name: told_units(own[name]) for name in (*alike, *times)}
                 told |= {axis: units for name, units in told.items() if name.lower() in POINT_KEYS for axis in "xyz"}
                 told[""] = first_unit(told_beside(arrays, f"{group}/{next(iter(alike))}".lstrip("/")))
-                found[group] = (columns, {name: units for name, units in told.items() if units})
+                others = tuple(name for name in own if name not in alike and name not in times)
+                found[group] = (columns, {name: units for name, units in told.items() if units}, others)
     return found
+
+
+def _times_of_frames(arrays: Mapping[str, Any], frames: np.ndarray) -> Columns:
+    """Returns the times (N) of rows that an array tells with one for each frame; {} without one, or where the frames' numbers
+    (N) fall, so that their order isn't sure.
+    """
+    if not len(frames) or (frames[1:] < frames[:-1]).any():
+        return {}
+    known, own = np.unique(frames, return_inverse=True)
+    named = [
+        name for name, one in arrays.items() if says_times(name) and math.prod(one.shape) == len(known) < len(frames)
+    ]
+    return {name: np.asarray(arrays[name][()]).reshape(-1)[own] for name in named}

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.regular_files import why_unreadable
 from dpcli.store import CloudSequence
 
 SPLITS = ("train", "validation", "test")
@@ -128,7 +129,12 @@ def require_folder(path: Path, expected: str) -> Path:
     """Returns ``path`` when it is a folder. Raises DataError that says what was looked for in it otherwise."""
     if path.is_dir():
         return path
-    found = "is a file" if path.exists() else "does not exist"
+    odd = why_unreadable(path).partition(", expected")
+    if odd[1]:
+        raise DataError(
+            f"{path}: {odd[0]}; raw data come from files and folders, not through a pipe: save them, and name these"
+        )
+    found = odd[0] or ("is a file" if path.exists() else "does not exist")
     raise DataError(f"{path}: {found}; expected a folder with {expected}")
 
 

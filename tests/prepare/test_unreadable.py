@@ -332,3 +332,17 @@ def test_what_lies_in_a_folder_that_a_link_names_is_not_passed_over(kind, tmp_pa
         file.with_name("._" + file.name).write_bytes(b"x")
     (tmp_path / "raw" / "more").symlink_to(tmp_path / "store")
     assert len(reader(tmp_path / "raw").items()) == 2
+
+
+def test_raw_data_that_are_no_file_are_called_what_they_are(tmp_path):
+    """As `dpc prepare clouds <(zcat a.csv.gz)` gives them."""
+    os.mkfifo(tmp_path / "a.csv")
+    (tmp_path / "b").symlink_to("nowhere")
+    for raw, said in (
+        ("a.csv", "a FIFO; .* not through a pipe"),
+        ("b", "a link to nowhere, which is missing; expected a folder"),
+    ):
+        ended = dpc("prepare", "clouds", tmp_path / raw, "-o", tmp_path / "o.h5")
+        assert ended.returncode == 3 and re.search(f"{raw}: {said}", ended.stderr)
+    said = dpc("prepare", "msraction3d", "/dev/null", "-o", tmp_path / "o.h5").stderr
+    assert "/dev/null: a device; raw data come from files and folders" in said

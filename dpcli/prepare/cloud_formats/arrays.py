@@ -11,6 +11,7 @@ from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, read_arrays
 from dpcli.prepare.array_files.attributes import says_unit, told_lengths, told_units
 from dpcli.prepare.array_files.containers import open_arrays, tables_inside
+from dpcli.prepare.array_files.frame_borders import frames_beside, rows_of_axes
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
@@ -89,8 +90,12 @@ def _as_vector(name: str, array: np.ndarray) -> np.ndarray:
 
 def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[str]) -> Cloud:
     key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
+    if key is None and (advice := rows_of_axes(arrays, timed=True)):
+        raise DataError(f"{path}: {advice}")
     if key is None and {"x", "y", "z"} <= arrays.keys():
         shape = arrays["x"].shape  # perhaps rows and columns of a grid
+        if advice := frames_beside(arrays, [arrays["x"].size]):
+            raise DataError(f"{path}: {advice}")
         alike = {k: a.reshape(-1) for k, a in arrays.items() if a.shape == shape}
         _refuse_frames(path, alike)
         cloud = cloud_of_columns(path, alike, keep)
@@ -100,6 +105,8 @@ def _cloud_of_arrays(path: Path, arrays: dict[str, np.ndarray], keep: Sequence[s
         held = [f"{name} (a pickle)" if one.dtype.hasobject else name for name, one in arrays.items()]
         raise DataError(f"{path}: arrays {', '.join(held) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
+    if advice := frames_beside(arrays, [len(cloud.points)]):
+        raise DataError(f"{path}: {advice}")
     cloud.columns = (key,)
     color_key, rows = next((k for k in _COLOR_KEYS if k in arrays), ""), len(cloud.points)
     if color_key:

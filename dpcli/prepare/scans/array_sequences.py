@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from dpcli.prepare.array_files.choosing import (
     says_times,
 )
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, others_inside, tables_inside
+from dpcli.prepare.array_files.frame_borders import frames_beside, rows_of_axes
 from dpcli.prepare.array_files.stored_sequence import StoredSequence, stored_sequence
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import first_unit, note_of_units
@@ -297,7 +299,13 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
             f"{path}: holds a table{f' ({first_names(tables, 5)})' if any(tables) else ''}, not an array of clouds; write it as .csv or"
             " .parquet (pandas: DataFrame.to_csv), and give --frame-column, or --track columns where a row is a frame"
         )
-    flat = [one for one in arrays.values() if not isinstance(one, list) and one.ndim == 2]
+    plain = {name: one for name, one in arrays.items() if not isinstance(one, list)}
+    totals = [one.shape[0] for one in plain.values() if one.ndim == 2 and one.shape[1] >= 3]
+    totals += [math.prod(one.shape) for name, one in plain.items() if name.rpartition("/")[2] in ("x", "X")]
+    advice = "" if axes else rows_of_axes(arrays, timed=False) or frames_beside(arrays, totals)
+    if advice:
+        raise DataError(f"{path}: {advice}")
+    flat = [one for one in plain.values() if one.ndim == 2]
     if flat and not axes:
         raise DataError(
             f"{path}: one cloud, or none, in {first_names(shapes, 5)}; expected (frames, points, 3), or a folder whose files are the"

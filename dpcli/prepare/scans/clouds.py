@@ -12,15 +12,22 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
+from dpcli.prepare.array_files.containers import SUFFIXES as CONTAINERS
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
+from dpcli.prepare.scans.tables import TABLES, open_table
+from dpcli.prepare.scans.times_of_tables import times_like_frames
 from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import Series, about_series
 
+TIMED = (
+    "column {0!r} tells times as far apart as those of frames, each for several points: if each file is a recording, give"
+    " --frame-column {0!r}; as it is, each is one cloud"
+)
 _LISTED = 8
 _LOOKED_AT = 5  # frames that tell how many columns a .bin has
 
@@ -72,22 +79,34 @@ class CloudFolders(OwnScans):
         return all(one.frame_times(self.fps) is not None for one in self._series)
 
     @cached_property
-    def _first(self) -> tuple[bool, tuple[str, ...]]:
-        """Returns whether the first good cloud has colors, and which of its columns are not read."""
+    def _first(self) -> tuple[bool, tuple[str, ...], Path | None]:
+        """Returns whether the first good cloud has colors, which of its columns are not read, and its file, None without one."""
         for one in self._series:
             try:
-                clouds = (read_cloud(path, self.bin_columns) for path in one.paths)
-                cloud = next((cloud for cloud in clouds if len(cloud.points)), None)
+                clouds = ((read_cloud(path, self.bin_columns), path) for path in one.paths)
+                cloud, path = next((found for found in clouds if len(found[0].points)), (None, None))
             except DataError:
                 continue  # a bad sample: the next one tells
             if cloud is None:  # nothing was seen
                 continue
-            return cloud.color is not None, without(cloud.unread, with_track(self.keep, self.track))
-        return False, ()
+            return cloud.color is not None, without(cloud.unread, with_track(self.keep, self.track)), path
+        return False, (), None
+
+    @cached_property
+    def _times_of_first(self) -> str:
+        """Returns the column of the first good cloud, of those that are not read, whose times are those of several frames."""
+        _, unread, path = self._first
+        if not unread or path is None or path.suffix.lower() not in (*TABLES, *CONTAINERS):
+            return ""
+        try:
+            table = open_table(path)
+            return times_like_frames(table, [name for name in unread if name in table.names])
+        except DataError:  # of arrays that are no table
+            return ""
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        color, unread = self._first
+        color, unread, _ = self._first
         items, told = [], {"color": color, "timed": self._timed, "unread": unread}
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
@@ -138,6 +157,8 @@ class CloudFolders(OwnScans):
         if self._first[1]:
             lines[0] += f"; not read: {first_names(self._first[1], _LISTED)}"
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"
+        if self._times_of_first:
+            lines.append(TIMED.format(self._times_of_first))
         if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
         labels = [item.label for item in items]

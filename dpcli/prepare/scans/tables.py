@@ -228,7 +228,7 @@ def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loade
     in_columns = reader.track == COLUMNS
     try:
         wide = read_wide(path) if in_columns else None
-        table = wide.table if wide else _open_table(path)
+        table = wide.table if wide else open_table(path)
         told = reader.frame_column or reader.sequence_column or reader.gap or find_frame_column(table.names)
         rows_count = wide is not None and not told
         column = "" if rows_count else frame_column(table, reader.frame_column)
@@ -240,11 +240,12 @@ def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loade
     if reader.track not in ("", ROWS, COLUMNS):
         cloud.track = name_rows(table, reader.track)
     apart = {*cloud.columns, column, reader.sequence_column}
-    unused = tuple(name for name in table.names if name and name not in apart)
-    named = [] if reader.sequence_column else find_recording_columns(unused)
+    beside = table.others if isinstance(table, ArrayTable) else ()
+    unused = (*(name for name in table.names if name and name not in apart), *beside)
+    named = [] if reader.sequence_column else find_recording_columns(without(unused, beside))
     recordings = {name: np.unique(table.words(table.names.index(name)), return_inverse=True)[1] for name in named}
     parts = wide.rows() if rows_count else split_rows(table, column, reader.sequence_column, reader.gap)
-    clocks = find_clocks(table, unused)
+    clocks = find_clocks(table, without(unused, beside))
     if wide:
         parts, points = [wide.spread(part) for part in parts], len(wide.trios)
         clocks = [replace(clock, seconds=np.repeat(clock.seconds, points)) for clock in clocks]
@@ -252,7 +253,8 @@ def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loade
     return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
-def _open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+def open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+    """Returns the table in a file of any format. Raises DataError where it holds none."""
     suffix = path.suffix.lower()
     return (
         ArrayTable(path) if suffix in SUFFIXES else ParquetTable(path) if suffix in COLUMNAR else read_text_table(path)

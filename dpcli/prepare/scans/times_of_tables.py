@@ -18,6 +18,7 @@ from dpcli.runtime.clips.name_numbers import is_ticks
 
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 SHORTEST = 1e-4  # seconds between frames: what is shorter are days, or times of points
+_APART = 5e-3  # seconds between frames whose points share a time
 _LONGEST = 1000.0  # seconds between frames: what seems longer was counted from another moment, in another unit
 _TIME_WORDS = frozenset(
     "time timestamp stamp t timestamps epoch utc ts datetime date posix zeit zeitstempel uhrzeit datum heure hora fecha".split()
@@ -173,6 +174,18 @@ def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:
         elif set(words_of(name)) & _TIME_WORDS and (clock := _one_column(table, name)):
             found.append(clock)
     return found
+
+
+def times_like_frames(table: Table, names: Sequence[str]) -> str:
+    """Returns the first of the columns ``names`` that tells times which never fall, of several rows each and as far apart as
+    frames are; "" without one. Those of a turning lidar's points are microseconds apart.
+    """
+    for clock in find_clocks(table, names):
+        steps = np.diff(clock.seconds)
+        apart = steps[steps != 0]
+        if len(apart) and apart.min() >= _APART and 2 * (len(apart) + 1) <= len(clock.seconds):
+            return clock.columns[0]
+    return ""
 
 
 def seconds_and_parts(table: Table, name: str) -> Clock | None:

@@ -221,13 +221,33 @@ def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
     """Returns how many frames of its first video a file declares beyond the `count` that were decoded, 0 where it is whole.
 
     times: seconds of the decoded frames f64 (count), None where they are not known. Frames that an edit list hides are no
-    loss; one is none either, since containers count differently, unless the file ends early.
+    loss; one is none either, since containers count differently, unless the file ends early or a packet of it is damaged.
     """
     cut = ends_early(path)
     container, stream = _open(path)
     with closing(container):
         declared, held = _declared_and_held(path, container, stream, count, times, cut)
-    return declared - held if declared > held + (not cut) else 0
+    if declared > held + (not cut):
+        return declared - held
+    damaged = _damaged_packets(path)  # behind the first of which some decoders stop
+    return max(damaged, _packets(path) - count) if damaged else 0
+
+
+def _damaged_packets(path: Path) -> int:
+    """Returns how many packets of the video can't be decoded, which OpenCV and ffmpeg don't tell."""
+    import av
+
+    damaged = 0
+    with open_container(path) as container:
+        try:
+            for packet in container.demux(_streams(container)[0]):
+                try:
+                    packet.decode()
+                except av.FFmpegError:
+                    damaged += 1
+        except av.FFmpegError:  # where the file ends
+            pass
+    return damaged
 
 
 def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | None, failed: bool) -> None:

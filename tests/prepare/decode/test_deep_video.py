@@ -164,6 +164,22 @@ def test_times_are_true_or_absent(tmp_path):
     np.testing.assert_allclose(given_rate.read(given_rate.items()[0], RNG).sequence.time, [0, 0.2, 0.4])
 
 
+@pytest.mark.parametrize("pixel_format, container", [("gray16le", "avi"), ("gray16le", "mkv"), ("gray12le", "avi")])
+@pytest.mark.parametrize("place", [2, 4])
+def test_frames_lost_to_one_whose_bytes_are_damaged_are_counted(tmp_path, pixel_format, container, place):
+    import av
+
+    frames = frames_of(bits_of(pixel_format), count=5)
+    path = encode(tmp_path / f"a.{container}", frames, pixel_format, "ffv1", "-g", "1")
+    assert read_depth_video(path).missing == 0
+    with av.open(str(path)) as file:
+        packet = [bytes(packet) for packet in file.demux() if packet.size][place]
+    data = path.read_bytes()
+    path.write_bytes(data.replace(packet, b"\xff" * len(packet)))
+    video = read_depth_video(path)
+    assert len(video.frames) in (place, 4) and video.missing == 5 - len(video.frames)  # OpenCV ends there
+
+
 def test_damaged_files_are_refused_or_give_the_frames_they_have(tmp_path):
     whole = encode(tmp_path / "d.mkv", frames_of(12, 9), "gray12le", "ffv1").read_bytes()
     (tmp_path / "d.mkv").write_bytes(whole[: len(whole) // 2])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta
 
+import h5py
 import numpy as np
 import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.scans.clouds import TIMED, CloudFolders
 from dpcli.prepare.scans.frames_of_tables import ROUNDED
 from dpcli.prepare.scans.tables import TableSequences
 
@@ -285,3 +287,33 @@ def test_durations_below_0_as_pandas_writes_them(tmp_path):
     )
     assert sequence.points[:, 2].tolist() == [1, 2, 0]
     np.testing.assert_allclose(sequence.time, [0, 0.15, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5"])
+@pytest.mark.parametrize(
+    "times, told",
+    [
+        (np.repeat([0.5, 0.6, 0.8], 4), True),
+        (np.repeat([0.5, 0.5001, 0.5002], 4), False),  # columns of a turning lidar
+        (np.arange(12) * 0.5, False),  # one for each point
+        (np.tile([0.5, 0.6, 0.7], 4), False),
+        (np.full(12, 0.5), False),
+    ],
+)
+def test_tables_of_a_folder_whose_times_are_those_of_several_frames_are_told(tmp_path, suffix, times, told):
+    """A folder's files are frames, so that recordings in them would become one cloud each."""
+    columns = {"time": times, **dict(zip("xyz", RNG.normal(size=(3, 12)).round(3)))}
+    for name in ("a1", "a2"):
+        path = tmp_path / f"{name}{suffix}"
+        rows = list(zip(*columns.values()))
+        if suffix == ".csv":
+            csv(path, ",".join(columns), rows)
+        else:
+            with h5py.File(path, "w") as file:
+                file["rows"] = np.array(rows, [(name, "f8") for name in columns])
+    reader = CloudFolders(tmp_path)
+    assert (TIMED.format("time") in reader.summary(reader.items())) == told
+    if told:  # and what is advised
+        reader = TableSequences(tmp_path, frame_column="time")
+        sequence = reader.read(reader.items()[0], RNG).sequence
+        np.testing.assert_allclose(sequence.time, [0, 0.1, 0.3], atol=1e-9)
