@@ -24,6 +24,7 @@ ANY_UNIT = ("height", "unit")  # normalizations after which the unit makes no di
 _RESTING = 10.0  # times as little as in training that a column may vary: who moves little has low speeds
 _MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
+_FEWER = 2.0  # times as many points in training: a model that learned from points repeated as often expects them
 _OTHER_RATE = 1.5  # times as many frames a second
 # of MSR-Action3D's training videos, which the shipped networks' files don't say
 _SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15}
@@ -212,7 +213,11 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
             log.warn(
                 f"{what}: a frame has {many:g} points in the median, {count:g} in what {model} learned from{_EXPECT}"
             )
-    elif info.timing != "slots" and theirs["points"] * _REPEATED < info.config.points_per_frame:
+    elif (
+        info.timing != "slots"
+        and theirs["points"] * _REPEATED < info.config.points_per_frame
+        and theirs["points"] * _FEWER < own.get("points", np.inf)
+    ):
         drawn = info.config.points_per_frame
         log.warn(
             f"{what}: a frame has {theirs['points']:g} points in the median, {model} takes {drawn}: repeated{_EXPECT}"

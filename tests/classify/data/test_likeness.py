@@ -56,6 +56,9 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     assert told(capsys, body(points=9), own, **notes) == ""
     assert "a frame has 300 points in the median, 5 in what" in told(capsys, body(), own, **notes)
     assert "length another one" in told(capsys, body(1000, points=5), own, **notes)
+    for learned, repeated in ((10, False), (300, True)):  # of a network that draws 2,048 points of each frame
+        notes = {"notes": {NOTE: like(body(points=learned))}}
+        assert ("repeated; expect fewer right" in told(capsys, body(points=9), own, **notes)) is repeated
     for odd in ({}, {"extent": "long", "points": None}, [1]):
         assert told(capsys, body(1000, points=5), own, notes={NOTE: odd}, timing="slots") == ""  # nothing is known
 
