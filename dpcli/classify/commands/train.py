@@ -31,6 +31,7 @@ from dpcli.classify.data.validation_split import (
     about_classes,
     about_other_splits,
     about_people,
+    about_tested_people,
     carve_validation,
     class_table,
     cross_folds,
@@ -271,6 +272,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     _tell_unlabeled(reader, ("train", "validation") if rule == "split" else ("train",))
     if others := about_other_splits(reader):
         log.warn(f"{path}: {others}")
+    if said := about_tested_people(reader, training, _tests(reader)):
+        log.warn(f"{path}: {said}")
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
     tell_mixed_rates(reader, training, looks, run.timing)

@@ -24,9 +24,11 @@ ANY_UNIT = ("height", "unit")  # normalizations after which the unit makes no di
 _RESTING = 10.0  # times as little as in training that a column may vary: who moves little has low speeds
 _MISSING = 0.5  # of a column's values, from which on it says nothing
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
+_FEWER = 2.0  # times as many points in training: a model that learned from points repeated as often expects them
 _OTHER_RATE = 1.5  # times as many frames a second
 # of MSR-Action3D's training videos, which the shipped networks' files don't say
-_SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15}
+_SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15, "x": 0.074, "y": 0.208, "z": 0.037}
+_LONG = 2.0  # times as far along one axis as along the others, as a body that stands
 _ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
 _FINE = 1e-5  # of coordinates up to 100: what lies in one point there is not rounded to it
@@ -34,15 +36,23 @@ _EXPECT = "; expect fewer right than in its training (another sensor?)"
 
 
 def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
-    """Returns the median distance of points f32 (N,3) of some frames from their median, the median number of points of a
-    frame, and the step to which float32 rounds coordinates so far from the origin; {} where no frame has any."""
+    """Returns the median distance of points f32 (N,3) of some frames from their median, also along each axis, the median number
+    of points of a frame, and the step to which float32 rounds coordinates so far from the origin; {} where no frame has any."""
     points = np.concatenate(frames) if len(frames) else np.zeros((0, 3))
     if not len(points):
         return {}
-    distance = np.linalg.norm(points - np.median(points, 0), axis=1)
+    away = points - np.median(points, 0)
+    distance = np.linalg.norm(away, axis=1)
+    along = dict(zip("xyz", np.median(np.abs(away), 0).tolist()))
     sizes = [len(frame) for frame in frames]
     step = np.spacing(np.abs(points).max().astype(np.float32))
-    return {"extent": float(np.median(distance)), "points": float(np.median(sizes)), "step": float(step)}
+    return {"extent": float(np.median(distance)), "points": float(np.median(sizes)), "step": float(step), **along}
+
+
+def _longest_axis(found: dict[str, float]) -> str:
+    """Returns the axis along which the points of `like` reach much farther than along both others, "" where none is."""
+    other, longest = sorted((found.get(axis, 0.0), axis) for axis in "xyz")[1:]
+    return longest[1] if longest[0] > _LONG * other[0] else ""
 
 
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
@@ -96,6 +106,8 @@ def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
     """Returns `file_like` of the videos that a model learned from, as far as it is known."""
     own = info.notes.get(NOTE) or (_SHIPPED if find_model(model).parent == SHIPPED else {})
     numbers = own if isinstance(own, dict) else {}
+    if numbers and (SHIPPED / f"{model}.safetensors").is_file():  # its notes may be older than those of axes
+        numbers = {axis: _SHIPPED[axis] for axis in "xyz"} | numbers
     return {key: value for key, value in numbers.items() if isinstance(value, int | float)}
 
 
@@ -208,13 +220,23 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
         )
     if far is None:
         return
+    up, longest = _longest_axis(own), _longest_axis(theirs)
+    if up and longest and up != longest:
+        log.warn(
+            f"{what}: what is seen is longest along {longest}, what {model} learned from along {up}: is another axis the"
+            " upright one? Then the scores would be meaningless; exchange the axes in the raw data to those of its training"
+        )
     if info.timing == "slots" and "points" in own:
         many, count = theirs["points"], own["points"]
         if not count / _OTHER_SENSOR < many < count * _OTHER_SENSOR:
             log.warn(
                 f"{what}: a frame has {many:g} points in the median, {count:g} in what {model} learned from{_EXPECT}"
             )
-    elif info.timing != "slots" and theirs["points"] * _REPEATED < info.config.points_per_frame:
+    elif (
+        info.timing != "slots"
+        and theirs["points"] * _REPEATED < info.config.points_per_frame
+        and theirs["points"] * _FEWER < own.get("points", np.inf)
+    ):
         drawn = info.config.points_per_frame
         log.warn(
             f"{what}: a frame has {theirs['points']:g} points in the median, {model} takes {drawn}: repeated{_EXPECT}"

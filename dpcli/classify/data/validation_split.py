@@ -225,6 +225,18 @@ def about_people(reader: CloudsReader, training: list[int], validation: list[int
     return f"{who}: people never seen come out lower (--validation subject holds whole people out)" if shared else ""
 
 
+def about_tested_people(reader: CloudsReader, training: list[int], tests: list[int]) -> str:
+    """Returns how many people of the file's tests are learned from, too, for the user, "" where none is."""
+    learned, tested = ({int(reader.subjects[i]) for i in some} - {-1} for some in (training, tests))
+    shared = len(learned & tested)
+    if not shared:
+        return ""
+    return (
+        f"{shared} of {counted(len(tested), 'person', 'people')} in the split 'test' {'is' if shared == 1 else 'are'} learned from, too:"
+        " people never seen come out lower (`dpc prepare split --by-subject` keeps people apart)"
+    )
+
+
 def class_table(reader: CloudsReader) -> list[str]:
     """Returns the class names; numbers where the file has labels but no names."""
     if reader.class_names:

@@ -61,7 +61,7 @@ class Lines:
         self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
-        """Prints the mean over all clips, (1+S,C), and how the stream ended."""
+        """Prints the mean over all clips, (1+S,C), and how the stream ended. People read it as confidence, as every line before."""
         average, highest = 1000 * self.seconds / max(self.count, 1), 1000 * self.highest
         if self.as_json:
             scores = {name: round(float(value), 6) for name, value in zip(self.class_names, mean[0])}
@@ -76,7 +76,7 @@ class Lines:
             print(json.dumps(row), flush=True)
             return
         print(
-            f"{end}: {counted(frames, 'frame')}, {counted(clips, 'clip')}: mean {self._text(mean)}; "
+            f"{end}: {counted(frames, 'frame')}, {counted(clips, 'clip')}: mean {self._text(self.confidence.of(mean))}; "
             f"latency {average:.0f} ms on average, at most {highest:.0f}",
             flush=True,
         )

@@ -25,6 +25,7 @@ from dpcli.classify.data.clips import (
 from dpcli.classify.data.validation_split import (
     about_absent_classes,
     about_people,
+    about_tested_people,
     carve_validation,
     default_rule,
     folds,
@@ -311,6 +312,24 @@ def test_people_who_train_and_validate_are_told(tmp_path, make_sequence, subject
     said = about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], [2, 3])
     assert said.startswith(told) and bool(said) == bool(told)
     assert about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], []) == ""
+
+
+@pytest.mark.parametrize(
+    "subjects, told",
+    [
+        ((0, 1, 2, 3), ""),
+        ((-1, -1, -1, -1), ""),
+        ((0, 1, 1, 3), "1 of 2 people in the split 'test' is learned from, too: people never seen come out lower"),
+        ((0, 0, 0, 0), "1 of 1 person in the split 'test' is"),
+        ((0, 1, 1, 0), "2 of 2 people in the split 'test' are"),
+    ],
+)
+def test_people_who_train_and_test_are_told(tmp_path, make_sequence, subjects, told):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a"]) as writer:
+        for k, subject in enumerate(subjects):
+            writer.write(make_sequence(f"v{k}", label=0, split="train" if k < 2 else "test", subject=subject))
+    said = about_tested_people(CloudsReader(tmp_path / "own.h5"), [0, 1], [2, 3])
+    assert said.startswith(told) and bool(said) == bool(told)
 
 
 def test_what_was_held_out_is_named_so_that_it_holds_for_other_files(tmp_path, make_sequence):

@@ -49,6 +49,17 @@ def test_a_shipped_network_tells_another_unit_and_few_points(capsys):
     assert "a frame has 20 points in the median, msraction3d-24 takes 2048: repeated" in told(capsys, body(points=20))
 
 
+@pytest.mark.parametrize(
+    ("shape", "longest"), [((1, 3, 1), ""), ((1, 1, 3), "z"), ((3, 1, 1), "x"), ((1, 2, 2), ""), ((1, 1, 1), "")]
+)
+def test_another_axis_that_is_upright_is_told(shape, longest, capsys):
+    """The shipped networks learned from bodies that stand along y; before a lidar they stand along z."""
+    notes = {NOTE: {"extent": 0.233}}  # as msraction3d-24 has them, which was made before axes were noted
+    said = told(capsys, [frame * np.array(shape, np.float32) / 2 for frame in body()], notes=notes)
+    assert said == "" or f"longest along {longest}, what msraction3d-24 learned from along y" in said
+    assert bool(said) is bool(longest)
+
+
 def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     own = tmp_path / "m.safetensors"
     own.touch()
@@ -56,6 +67,9 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     assert told(capsys, body(points=9), own, **notes) == ""
     assert "a frame has 300 points in the median, 5 in what" in told(capsys, body(), own, **notes)
     assert "length another one" in told(capsys, body(1000, points=5), own, **notes)
+    for learned, repeated in ((10, False), (300, True)):  # of a network that draws 2,048 points of each frame
+        notes = {"notes": {NOTE: like(body(points=learned))}}
+        assert ("repeated; expect fewer right" in told(capsys, body(points=9), own, **notes)) is repeated
     for odd in ({}, {"extent": "long", "points": None}, [1]):
         assert told(capsys, body(1000, points=5), own, notes={NOTE: odd}, timing="slots") == ""  # nothing is known
 

@@ -599,9 +599,11 @@ def test_lines_tell_the_confidence_that_the_threshold_is_held_against(capsys):
     for row in ([0.5, 0.48, 0.02], [0.48, 0.26, 0.26]):
         scores = np.array([row, row], np.float32)
         lines.write(Prediction(7, 1, scores, scores), 0.05, 0)
-    rejected, named = capsys.readouterr().out.splitlines()
+    lines.finish(scores, 9, 2, "end of stream")
+    rejected, named, last = capsys.readouterr().out.splitlines()
     assert rejected == "frame 7: nothing happening; best wave 0.52 (static wave 0.52); 50 ms"
     assert named == "frame 7: wave 0.63 (static wave 0.63); 50 ms"
+    assert last.startswith("end of stream: 9 frames, 2 clips: mean wave 0.63 (static wave 0.63); ")
 
 
 def test_a_silence_is_told_once_and_counted(capsys):
