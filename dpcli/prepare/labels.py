@@ -154,7 +154,9 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
             raise DataError(f"{where}: label {label} is out of range; labels count from 0")
         subject = people.get(record.get("subject", ""), record.get("subject", "")) or "-1"
         if not _is_number(subject) or len(subject) > 10 or int(subject) >= 1 << 31:
-            raise DataError(f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31")
+            raise DataError(
+                f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31: number the people, alike in all tables"
+            )
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), split_called(split) or split)
     warn_of_splits(path, (row.split for row in rows.values()))

@@ -91,7 +91,7 @@ def test_whole_numbers_may_be_written_with_a_fraction_of_0(tmp_path, comma):
 
 @pytest.mark.parametrize("subjects", [("m1", "f1"), ("anna", "ben"), ("s1", "2"), ("1.5", "2.5")])
 def test_subjects_whose_numbers_may_be_of_two_people_are_refused(tmp_path, subjects):
-    with pytest.raises(DataError, match="expected a whole number"):
+    with pytest.raises(DataError, match="expected a whole number .*: number the people, alike in all tables"):
         table(tmp_path, "name,label,subject\n" + "".join(f"v{k},wave,{one}\n" for k, one in enumerate(subjects)))
 
 
