@@ -21,18 +21,34 @@ _CAMERA = np.diag([1.0, -1.0, -1.0])  # a camera's axes, x right, y down, z forw
 
 
 class Thinned:
-    """Keeps at most `most` items of a row of any length, evenly spread: when it is full, every other one goes."""
+    """Keeps at most `most` rows of any number, evenly spread: when it is full, every other one goes.
 
-    def __init__(self, most: int) -> None:
-        self.most, self.every, self.count = most, 1, 0
-        self.items: list[Any] = []
+    Rows lie in one array from the start: small ones of their own, made between the arrays of a network, would keep the memory
+    around them from being used again (hundreds of MB in an hour).
+    """
 
-    def add(self, item: Any) -> None:
-        """Takes the next item of the row, or passes it over."""
-        if self.count % self.every == 0:
-            self.items.append(item)
-            if len(self.items) > self.most:
-                self.items, self.every = self.items[::2], 2 * self.every
+    def __init__(self, most: int, kind: np.dtype) -> None:
+        self.every, self.count = 1, 0
+        self._rows, self._kept = np.zeros(most + 1, kind), 0
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Returns the rows that are kept."""
+        return self._rows[: self._kept]
+
+    @property
+    def wants_next(self) -> bool:
+        """Returns whether the next row will be kept for now."""
+        return self.count % self.every == 0
+
+    def add(self, row: tuple[Any, ...] = ()) -> None:
+        """Takes the next row, or passes it over, when it may be left out."""
+        if self.wants_next:
+            self._rows[self._kept] = row
+            self._kept += 1
+            if self._kept == len(self._rows):
+                kept = self._rows[::2].copy()
+                self._rows[: len(kept)], self._kept, self.every = kept, len(kept), 2 * self.every
         self.count += 1
 
 
@@ -41,15 +57,19 @@ class LivePage:
 
     def __init__(self, path: Path, title: str, class_names: Sequence[str], how: Cutting, command: str) -> None:
         self.path, self.title, self.class_names, self.how, self.command = path, title, list(class_names), how, command
-        self._frames, self._made = Thinned(_MOST_FRAMES), Thinned(_MOST_PREDICTIONS)
+        frame = [("number", np.int64), ("size", np.int64), ("points", np.float32, (_MOST_POINTS, 3))]
+        made = [("frame", np.int64), ("scores", np.float32, (len(self.class_names),)), ("latency", np.float64)]
+        self._frames = Thinned(_MOST_FRAMES, np.dtype(frame))
+        self._made = Thinned(_MOST_PREDICTIONS, np.dtype(made))
 
     def see(self, points: np.ndarray, silent: float) -> None:
         """Takes a frame f32 (P,3) before it is predicted; silent: seconds since the one before."""
-        number, shown = self._frames.count, None
-        if number % self._frames.every == 0:
-            keep = generator(0, number).permutation(len(points))[:_MOST_POINTS]
-            shown = (number, points[keep] @ _CAMERA.T)
-        self._frames.add(shown)
+        if not self._frames.wants_next:
+            return self._frames.add()
+        number, shown = self._frames.count, np.zeros((_MOST_POINTS, 3), np.float32)
+        keep = generator(0, number).permutation(len(points))[:_MOST_POINTS]
+        shown[: len(keep)] = points[keep] @ _CAMERA.T
+        self._frames.add((number, len(keep), shown))
 
     def write(self, made: Prediction, latency: float, waiting: int) -> None:
         """Takes a prediction; latency in seconds."""
@@ -57,9 +77,9 @@ class LivePage:
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """Writes the page. end: how the stream ended."""
-        numbers, shown = zip(*self._frames.items)
-        sequence = PageSequence(self.title, list(numbers), frames, list(shown))
-        last, scores, latency = (np.array(column) for column in zip(*self._made.items))
+        shown = [row["points"][: row["size"]] for row in self._frames.rows]
+        sequence = PageSequence(self.title, self._frames.rows["number"].tolist(), frames, shown)
+        last, scores, latency = (self._made.rows[name] for name in ("frame", "scores", "latency"))
         confidence = self.how.confidence
         hop = int(last[1] - last[0]) if len(last) > 1 else self.how.hop
         how = Cutting(self.how.window, hop, max(self.how.shortest, hop), confidence)
