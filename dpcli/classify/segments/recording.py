@@ -45,18 +45,21 @@ class WindowScores:
 
 def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: int, bar: Progress) -> WindowScores:
     """Returns what the windows of a recording say; some hundred frames are in memory at a time."""
-    made: list[Prediction | None] = []
-    times = []
-    columns = predictor.info.config.column_fields
-    for block in _blocks(reader, sequence, columns):
-        made += [predictor.add(frame) for frame in frames_with_columns(block, columns)]
-        times.append(block.time)
-        bar.advance(block.num_frames)
-    made.append(predictor.finish())
-    done = [one for one in made if one is not None]
-    last, scores = np.array([one.frame for one in done], np.int64), np.stack([one.scores[0] for one in done])
+    most = int(reader.frame_counts[sequence]) // predictor.hop + 1
+    last, scores = np.zeros(most, np.int64), np.zeros((most, len(predictor.info.class_names)), np.float32)
+    made, times, columns = 0, [], predictor.info.config.column_fields
+
+    def predictions() -> Iterator[Prediction | None]:
+        for block in _blocks(reader, sequence, columns):
+            times.append(block.time)
+            yield from map(predictor.add, frames_with_columns(block, columns))
+            bar.advance(block.num_frames)
+        yield predictor.finish()
+
+    for one in filter(None, predictions()):
+        last[made], scores[made], made = one.frame, one.scores[0], made + 1
     time = None if times[0] is None else np.concatenate(times)
-    return WindowScores(last, scores, predictor.window.count, time)
+    return WindowScores(last[:made], scores[:made], predictor.window.count, time)
 
 
 def _blocks(reader: CloudsReader, sequence: int, columns: tuple[str, ...]) -> Iterator[CloudSequence]:
