@@ -29,7 +29,6 @@ from dpcli.runtime.provenance import record
 from dpcli.store import CloudSequence, CloudsWriter
 
 FPS, POINTS = 30, 256
-MODEL = "train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1 --force"
 
 
 @dataclass(frozen=True)
@@ -112,13 +111,9 @@ def feed(pipe, frames: int) -> None:
 
 
 def stream(folder: Path, asked: argparse.Namespace) -> bool:
-    """Predicts while frames arrive."""
-    gestures = (
-        "prepare synthetic gestures -o gestures.h5 --videos-per-class 1 --subjects 2 --frames 18 --points 200 --force"
-    )
-    for line in (gestures, f"classify {MODEL}"):
-        subprocess.run(dpc(*line.split()), cwd=folder, check=True, capture_output=True)
-    words = dpc("classify", "predict", "-", "--stream", "--json", "--model", "model", "--hop", 8)
+    """Predicts while frames arrive, and keeps what its page shows."""
+    shown = ("--json", "--page", "live.html", "--force")
+    words = dpc("classify", "predict", "-", "--stream", "--model", "msraction3d-24", "--hop", 8, *shown)
     process = subprocess.Popen(
         words, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )
