@@ -186,6 +186,12 @@ def test_a_principal_point_of_another_size_is_refused(factor):
     assert Calibration(Intrinsics(300, 300, 500, 240)).of_pictures(640, 480)
 
 
+@pytest.mark.parametrize("focal", [3.6, 1e6])
+def test_focal_lengths_that_are_no_pixels_are_refused(focal):
+    with pytest.raises(DataError, match="expected pixels, not millimeters"):
+        Calibration(Intrinsics(focal, focal, 320, 240), 640, 480).of_pictures(640, 480)
+
+
 def test_what_only_sounds_like_a_depth_scale_is_none_and_two_that_differ_are_refused(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_max": 4, "depth_to_color": [1], "unit": 2}))
     assert read_calibration(tmp_path / "k.json").depth_scale is None
