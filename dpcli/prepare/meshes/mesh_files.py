@@ -183,9 +183,12 @@ def _of_ply(path: Path) -> Polygons:
     from plyfile import PlyData
 
     held = PlyData.read(path)
-    corners = next(one for one in held["face"].properties if one.name in ("vertex_indices", "vertex_index"))
+    names = [one.name for one in held["face"].properties]
+    corners = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
+    if corners is None:
+        raise DataError(f"{path}: its faces have {', '.join(names)}; expected vertex_indices: export it again")
     points = np.stack([held["vertex"][axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return points, list(held["face"][corners.name])
+    return points, list(held["face"][corners])
 
 
 def _of_off(vertices: int, rows: list[bytes]) -> Polygons:
