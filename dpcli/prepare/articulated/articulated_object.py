@@ -319,7 +319,13 @@ def _radius(obj: ArticulatedObject, closed: set[int]) -> float:
 def require_surface(obj: ArticulatedObject) -> ArticulatedObject:
     """Returns the object when it has joints and a surface. Raises DataError otherwise."""
     if not obj.joints:
-        raise DataError(f"{obj.name}: no movable joint (revolute, continuous or prismatic); nothing in it can move")
+        raise DataError(nothing_moves(obj.name, obj.notes))
     if not len(obj.triangles):
         raise DataError(f"{obj.name}: none of its meshes has an area; expected a surface to sample")
     return obj
+
+
+def nothing_moves(name: object, notes: Counter) -> str:
+    """Returns what is said of an object without a joint that moves, with what is odd in it, such as joints taken as fixed."""
+    odd = "".join(f"; {what}: {count}" for what, count in notes.items())
+    return f"{name}: no movable joint (revolute, continuous or prismatic); nothing in it can move{odd}"

@@ -13,6 +13,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
+from dpcli.prepare.articulated.articulated_object import nothing_moves
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
 from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
@@ -190,5 +191,5 @@ def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int, list
         more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0, []
     if not skeleton.joints:
-        return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0, []
+        return nothing_moves(path, skeleton.notes), 0, []
     return "", len(skeleton.joints), list(meshes.values())

@@ -28,7 +28,10 @@ _LARGE = 20.0  # meters, of a mesh
 _MILLIMETERS = (
     f"meshes larger than {_LARGE:g} m (are they in millimeters? a URDF has meters; scale in <mesh> changes them)"
 )
-_EQUAL = "joints whose two limits are equal taken as fixed (as SolidWorks exports joints without limits)"
+_EQUAL = (
+    "joints whose two limits are equal taken as fixed (SolidWorks exports joints without limits so; to move them, give them"
+    " limits or the type continuous)"
+)
 
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
 _READ = {  # elements, and which of those within them count

@@ -42,12 +42,16 @@ _SCALE = re.compile(  # a key of the depth scale without what is no letter, and 
     r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
     r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
 )
-_LENS = tuple("coeffs distortion_coefficients distortion_coeffs d dist_coeffs distcoeffs distortion disto".split())
+_LENS = re.compile(  # a key of a lens's coefficients without what is no letter
+    r"d|kc|coeff(?:icient)?s|disto|(?:cam(?:era)?|lens|depth|ir)*dist(?:ort(?:ion)?)?"
+    r"(?:coe?ff?(?:icient)?|param(?:eter)?|vec(?:tor)?|mat(?:rix)?|model)?s?"
+)
 _TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenCV's order
 _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
-_BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
+_BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "pinhole", "none")
+_BROWN += ("radtan", "radial_tangential")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
-_ABOUT_CAMERAS = "distortions?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
+_ABOUT_CAMERAS = "projection|dist(?:ortions?)?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
 _COLMAP = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -103,8 +107,9 @@ def camera_of_arrays(
     told = {k.lower(): v.item() if v.size == 1 else v.tolist() for k, v in small.items() if v.dtype.kind in "uifU"}
     camera = _of_mapping(path, told) if _holds_camera(told) else None
     scale = camera.depth_scale if camera else _depth_scale(path, told, {})
-    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_LENS, *_MODEL, "width", "height") if camera else ()
-    return camera, scale, tuple(k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
+    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_MODEL, "width", "height") if camera else ()
+    unread = (k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
+    return camera, scale, tuple(k for k in unread if not (camera and _LENS.fullmatch(_letters(k.lower()))))
 
 
 def camera_of_any(
@@ -321,10 +326,8 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
 
 
 def _is_lens_of(key: str, camera: str) -> bool:
-    """Returns whether a key says that it holds the lens of the camera beside it, such as ``depthDistortion`` of
-    ``depthIntrinsic``.
-    """
-    if not re.search("distort", key, re.IGNORECASE):
+    """Returns whether a key says that it holds the lens of the camera beside it: ``depthDistortion`` of ``depthIntrinsic``."""
+    if not re.search("dist(?!an)", key, re.IGNORECASE):
         return False
     plain = [re.sub(_ABOUT_CAMERAS, "", re.sub("[^a-z]", "", word.lower())) for word in (key, camera)]
     return plain[0] == plain[1]
@@ -408,11 +411,12 @@ def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
 
 def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
-    values = _first(own, _LENS)
+    values = _coefficients(own)
     told = own.get("distortion")  # as RealSense's tools print it, or what stands beside the coefficients
     told = _first({str(k).lower(): v for k, v in told.items()}, _MODEL) if isinstance(told, dict) else told
     if isinstance(values, dict):
-        values = values["data"] if "data" in values else _named_terms(path, values)
+        listed = values.get("data", _coefficients({str(key).lower(): value for key, value in values.items()}))
+        values = _named_terms(path, values) if listed is None else listed
     if values is None and any(key in own for key in _TERMS):
         values = _named_terms(path, {key: own[key] for key in _TERMS if key in own})
     if values is None and (radial := own.get("radial_distortion", own.get("radialdistortion"))) is not None:
@@ -424,10 +428,20 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     return lens_coefficients(path, str((isinstance(told, str) and told) or _first(own, _MODEL) or ""), flat)
 
 
+def _coefficients(part: dict[str, Any]) -> Any:
+    """Returns the list or mapping of a lens: the last, which stands nearest to the camera, but before all what isn't called
+    ``distortion``, which may hold the model alone.
+    """
+    found = ((key, part[key]) for key in reversed(part) if _LENS.fullmatch(_letters(key)))
+    listed = {key: value for key, value in found if value and isinstance(value, (list, dict))}
+    return listed[min(listed, key="distortion".__eq__)] if listed else None
+
+
 def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
     """Returns the coefficients of a lens that a mapping names. Raises DataError at one that isn't known."""
     small = {str(key).lower(): value or 0.0 for key, value in terms.items()}
-    strange = [key for key in small if key not in _TERMS and _are_numbers([small[key]]) and small[key]]
+    told = {key: value for key, value in small.items() if key not in _TERMS and value}
+    strange = [key for key, value in told.items() if _are_numbers([value]) or isinstance(value, list) and any(value)]
     if strange:
         raise DataError(f"{path}: its lens has a coefficient {strange[0]}; expected {', '.join(_TERMS)} alone")
     return [small.get(key, 0.0) for key in (_TERMS if any(small.get(key) for key in _TERMS[5:]) else _TERMS[:5])]

@@ -13,6 +13,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 
 _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
+_WIDEST, _LONGEST = 0.1, 1000  # focal lengths in sides of the picture: of 157 degrees, and of what no depth camera has
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
 
@@ -144,7 +145,8 @@ class Calibration:
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
 
-        Raises DataError when they are of another shape, or when the principal point lies outside of the pictures.
+        Raises DataError when they are of another shape, when the principal point lies outside of the pictures, or when a focal
+        length can't be one in pixels.
         """
         own, found = f"{self.width}x{self.height}", f"{width}x{height}"
         camera = self.intrinsics
@@ -170,6 +172,12 @@ class Calibration:
             raise DataError(
                 f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) {where} these {found} pictures;"
                 " expected a calibration of pictures of this size, or its width and height beside it"
+            )
+        shares = (camera.fx / width, camera.fy / height)
+        if min(shares) < _WIDEST or max(shares) > _LONGEST:
+            raise DataError(
+                f"{self.source}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels for {found} pictures, which no depth camera"
+                " has; expected pixels, not millimeters or degrees: pixels = millimeters x width / the sensor's width"
             )
         return camera
 

@@ -43,6 +43,7 @@ _LOST = re.compile(  # what pycollada says where a mesh, or how it is turned, is
 )
 _COLORED = re.compile(rb"<((?:\w+:)?bind_material)\b[^>]*?(?:/>|>.*?</\1>)", re.DOTALL)  # no shape depends on it
 _SOLID = rb"(?i)\s*solid"
+_CORNER, _LOOP = (re.compile(rb"(?im)^\s*%b\s" % word) for word in (b"vertex", b"outer\\s+loop"))  # of an STL
 _SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
 
@@ -177,9 +178,12 @@ def _of_ply(path: Path) -> Polygons:
     from plyfile import PlyData
 
     held = PlyData.read(path)
-    corners = next(one for one in held["face"].properties if one.name in ("vertex_indices", "vertex_index"))
+    names = [one.name for one in held["face"].properties]
+    corners = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
+    if corners is None:
+        raise DataError(f"{path}: its faces have {', '.join(names)}; expected vertex_indices: export it again")
     points = np.stack([held["vertex"][axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return points, list(held["face"][corners.name])
+    return points, list(held["face"][corners])
 
 
 def _of_off(vertices: int, rows: list[bytes]) -> Polygons:
@@ -197,10 +201,8 @@ def _check_collada(path: Path) -> None:
         raise DataError(f"{path}: it has parts with bones (controllers), which are not read; export it as plain meshes")
     if re.search(rb"<(\w+:)?ph\b", data):
         raise DataError(f"{path}: it has polygons with holes, which are not read; export it as triangles")
-    if name := _spread_positions(data):
-        raise DataError(
-            f"{path}: the positions of {name!r} lie between other numbers, which is not read; export it again"
-        )
+    if what := _misread(data):
+        raise DataError(f"{path}: {what}, which is not read; export it again")
     sizes = {size for row in re.findall(rb"vcount>([^<]*)", data) for size in row.split()}
     if sizes <= {b"3"} and not re.search(rb"<(\w+:)?polygons\b", data):
         return
@@ -220,20 +222,26 @@ def _check_collada(path: Path) -> None:
             raise DataError(f"{path}: some of its polygons aren't convex; export it again as triangles")
 
 
-def _spread_positions(data: bytes) -> str:
-    """Returns the id of a source of positions in a COLLADA file that are not every three numbers of its array in turn, as the
-    reader takes them; else nothing.
+def _misread(data: bytes) -> str:
+    """Returns what in a COLLADA file its reader would take for something else, else nothing: sources of positions that are not
+    every three numbers of their array in turn, shapes placed by ``lookat``, and a unit that isn't a number.
     """
     from lxml import etree
 
     root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    for unit in root.iterfind("{*}asset/{*}unit[@meter]"):
+        if not re.fullmatch(r"\s*[\d.]+(e[-+]?\d+)?\s*", unit.get("meter"), re.IGNORECASE):
+            return f"its unit is {unit.get('meter')!r} meters"
+    for node in root.iterfind(".//{*}node[{*}lookat]"):
+        if next(node.iter("{*}instance_geometry", "{*}instance_node"), None) is not None:
+            return f"the shapes of the node {node.get('id')!r} are placed by <lookat>"
     for mesh in root.iterfind(".//{*}mesh"):  # exporters give one id to sources of several
         named = {one.get("source") for one in mesh.iterfind("{*}vertices/{*}input[@semantic='POSITION']")}
         for source in mesh.iterfind("{*}source"):
             accessor = source.find("{*}technique_common/{*}accessor")
             given = ("0", "3") if accessor is None else (accessor.get("offset", "0"), accessor.get("stride", "3"))
             if f"#{source.get('id')}" in named and tuple(map(str.strip, given)) != ("0", "3"):
-                return str(source.get("id"))
+                return f"the positions of {source.get('id')!r} lie between other numbers"
     return ""
 
 
@@ -332,6 +340,8 @@ def _check_stl(path: Path, data: bytes) -> None:
         _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))
     elif re.match(_SOLID, data) and not re.search(rb"(?i)\bendsolid\b[^\n]*\s*\Z", data):
         raise DataError(f"{path}: truncated: it doesn't end with endsolid; copy it again")
+    elif re.match(_SOLID, data) and len(_CORNER.findall(data)) != 3 * len(_LOOP.findall(data)):
+        raise DataError(f"{path}: some of its faces are no triangles, and an STL has no others; export it as triangles")
     elif not re.match(_SOLID, data):
         raise DataError(
             f"{path}: truncated: its header alone has {_STL_HEAD} bytes, it holds {len(data)}; copy it again"

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.articulated.articulated_object import nothing_moves
 from dpcli.prepare.articulated.articulated_sequence import Articulation, draw_sequence, study
 from dpcli.prepare.articulated.sapien import Sapien, find_objects
 from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
@@ -106,8 +107,11 @@ def test_equal_limits_and_floating_joints_are_fixed(tmp_path):
     for options in ({"limits": "0.5 0.5"}, {"kind": "floating"}, {"kind": "planar"}, {"kind": "fixed"}):
         obj = load(two(tmp_path, **options))
         assert obj.num_bodies == 1 and len(obj.notes) == (options != {"kind": "fixed"})
-        with pytest.raises(DataError, match="r.urdf: no movable joint"):
+        said = "give them limits or" if "limits" in options else "taken as fixed" if obj.notes else "can move$"
+        with pytest.raises(DataError, match=f"r.urdf: no movable joint .*{said}"):
             study(obj, Articulation())
+        problem = Sapien(tmp_path / "r.urdf").items()[0].problem
+        assert problem.endswith(nothing_moves("r.urdf", obj.notes))
     assert load(two(tmp_path, kind="planar")).notes == {"planar joints taken as fixed": 1}
     turned = load(two(tmp_path, limits="1.5707963267948966 1.5707963267948966")).triangles[12:].reshape(-1, 3)
     np.testing.assert_allclose(turned.max(0), [0.25, 1, 0.8], atol=1e-9)  # the one value of the joint is kept

@@ -186,6 +186,12 @@ def test_a_principal_point_of_another_size_is_refused(factor):
     assert Calibration(Intrinsics(300, 300, 500, 240)).of_pictures(640, 480)
 
 
+@pytest.mark.parametrize("focal", [3.6, 1e6])
+def test_focal_lengths_that_are_no_pixels_are_refused(focal):
+    with pytest.raises(DataError, match="expected pixels, not millimeters"):
+        Calibration(Intrinsics(focal, focal, 320, 240), 640, 480).of_pictures(640, 480)
+
+
 def test_what_only_sounds_like_a_depth_scale_is_none_and_two_that_differ_are_refused(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_max": 4, "depth_to_color": [1], "unit": 2}))
     assert read_calibration(tmp_path / "k.json").depth_scale is None
@@ -200,6 +206,10 @@ def test_what_only_sounds_like_a_depth_scale_is_none_and_two_that_differ_are_ref
         {"depthIntrinsic": PLAIN, "depthDistortion": {"k1": 0.2, "k2": 0.0}, "rgbDistortion": {"k1": 0.9}},
         {"intrinsics": PLAIN, "distortion": {"model": "plumb_bob", "k1": 0.2}},
         {"depth": {"intrinsics": PLAIN, "distortion_coefficients": [0.2, 0, 0, 0, 0]}},
+        {"projection_parameters": PLAIN, "distortion_parameters": {"k1": 0.2, "k2": 0.0}},  # of VINS
+        {"intrinsics": PLAIN, "dist": {"k1": 0.2}},
+        {"intrinsics": {**PLAIN, "distortion": {"model": "plumb_bob", "coefficients": [0.2, 0, 0, 0, 0]}}},
+        {"distortion_coefficients": [9, 0, 0, 0, 0], "depth": {**PLAIN, "coeffs": [0.2, 0, 0, 0, 0]}},
     ],
 )
 def test_the_lens_may_stand_beside_the_camera(tmp_path, content):
@@ -413,14 +423,21 @@ def test_calibrations_of_matlab_and_of_ros_as_ini(tmp_path, name, text):
         assert getattr(found.intrinsics, side) == pytest.approx(getattr(CAMERA, side))
 
 
-@pytest.mark.parametrize("matrix", ["camera_matrix", "cameraMatrix", "Camera_Matrix", "K"])
+@pytest.mark.parametrize(
+    ("matrix", "lens"),
+    [
+        *((name, "distortion_coefficients") for name in ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")),
+        ("cameraMatrix", "distortionCoefficients"),  # of iai_kinect2
+        *(("K", name) for name in ("dist", "dist_coefs", "distCoeff", "distortion_params", "kc", "lens_distortion")),
+    ],
+)
 @pytest.mark.parametrize("suffix", ["xml", "yml", "json"])
-def test_every_form_of_opencvs_storage_tells_the_same(tmp_path, matrix, suffix):
+def test_every_form_of_opencvs_storage_tells_the_same(tmp_path, matrix, lens, suffix):
     path = tmp_path / f"c.{suffix}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Tue Mar  5 14:30:00 2024")
     storage.write(matrix, np.array(NESTED))
-    storage.write("distortion_coefficients", np.array([[0.1, -0.2, 0.001, 0.002, 0.03]]))
+    storage.write(lens, np.array([[0.1, -0.2, 0.001, 0.002, 0.03]]))
     for side, pixels in (("image_width", 640), ("image_height", 480)):
         storage.write(side, pixels)
     storage.release()

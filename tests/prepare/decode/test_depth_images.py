@@ -105,6 +105,40 @@ def test_openexr_of_several_parts_and_with_an_alpha_that_comes_first(tmp_path):
         read_frame(tmp_path / "which.exr")
 
 
+@pytest.mark.parametrize(
+    ("depth", "beside"),
+    [
+        (["ViewLayer.Depth.Z"], ["ViewLayer.Mist.Z"]),  # of Blender
+        (["ViewLayer.Depth.Z"], ["ViewLayer.Denoising Depth.Z"]),
+        ([f"MovieRenderQueue_WorldDepth.{one}" for one in "RGB"], ["MovieRenderQueue_WorldDepth.A"]),  # of Unreal
+        ([], ["ViewLayer.Mist.Z"]),
+    ],
+)
+def test_openexr_of_renderers_that_write_many_layers(tmp_path, depth, beside):
+    openexr = pytest.importorskip("OpenEXR")
+    frame, *others = np.random.default_rng(0).uniform(1, 2, (4, 6, 8)).astype(np.float32)
+    channels = {f"Combined.{one}": other for one, other in zip("RGB", others)} | dict.fromkeys(beside, others[0])
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    openexr.File(header, channels | dict.fromkeys(depth, frame)).write(str(tmp_path / "a.exr"))
+    if depth:
+        np.testing.assert_array_equal(read_frame(tmp_path / "a.exr"), frame)
+    else:
+        with pytest.raises(DataError, match=r"a.exr: holds channels .*Mist.Z; expected one called Z or depth"):
+            read_frame(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("names", [["depth"], ["mask", "depth"]])
+def test_openexr_that_lost_its_end_is_not_taken_for_what_is_left(tmp_path, names):
+    openexr = pytest.importorskip("OpenEXR")
+    frame = np.random.default_rng(0).uniform(1, 2, (60, 80)).astype(np.float32)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    parts = [openexr.Part(dict(header), {"Z" if name == "depth" else "Y": frame}, name) for name in names]
+    openexr.File(parts).write(str(tmp_path / "a.exr"))
+    (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-3000])
+    with pytest.raises(DataError, match="a.exr: not a readable OpenEXR image"):
+        read_frame(tmp_path / "a.exr")
+
+
 @pytest.mark.parametrize("kind", ["u1", "<u2", ">u2", "<i2", ">i4", "<u4", "f2", "<f4", ">f8"])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_arrays_of_numpy(tmp_path, kind, order):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,10 +11,13 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.runtime.clips.images import require_plausible
 
+_NO_DEPTH = re.compile("mist|denois", re.IGNORECASE)  # layers of Blender that have a Z, too
+
 
 def read_exr(path: Path) -> tuple[np.ndarray, str]:
     """Reads one frame (H,W) f32 or u32 of an ``.exr``, and the name of its channel: the only one, the one called Z or depth, or
-    three equal ones; of several parts those of all, and beside others no alpha, nor the Z of a normal or a place.
+    several equal ones, as gray in three; of several parts those of all, and beside others no alpha, nor the Z of a normal, a place
+    or mist.
 
     The frame is the whole picture (the display window), 0 where the file holds no pixels of it. Raises DataError when it can't be
     read, holds colors, or OpenEXR is not installed.
@@ -23,11 +27,14 @@ def read_exr(path: Path) -> tuple[np.ndarray, str]:
     except ImportError:
         raise DataError(f"{path}: OpenEXR is needed to read it; pip install 'dpc-toolkit[exr]'") from None
     try:
-        for part in OpenEXR.File(str(path), True, True).parts:
+        headers = OpenEXR.File(str(path), True, True).parts
+        for part in headers:
             for window in (part.header["dataWindow"], part.header["displayWindow"]):
                 width, height = (int(b) - int(a) + 1 for a, b in zip(*window))
                 require_plausible(path, width, height, path.stat().st_size)
         parts = OpenEXR.File(str(path), True).parts
+        if len(parts) < len(headers):  # the library leaves out what it can't decode
+            raise ValueError
         channels = {
             f"{part.name()}.{name}" if len(parts) > 1 else name: (channel.pixels, part.header)
             for part in parts
@@ -37,9 +44,8 @@ def read_exr(path: Path) -> tuple[np.ndarray, str]:
         raise
     except Exception:  # RuntimeError, and of a file that lost its end ValueError
         raise DataError(f"{path}: not a readable OpenEXR image (empty, truncated, or of another kind)") from None
-    named = [name for name in channels if _says_depth(name) and not _is_of_vector(name, channels)]
     opaque = [name for name in channels if name.rpartition(".")[2] != "A"] or list(channels)
-    chosen = named if len(named) == 1 else opaque
+    chosen = [name for name in opaque if _says_depth(name) and not _is_of_vector(name, channels)] or opaque
     first, header = channels[chosen[0]]
     if first.dtype.kind not in "uf":
         raise DataError(f"{path}: holds deep pixels, many depths in each; expected one depth a pixel: render it flat")
@@ -50,6 +56,8 @@ def read_exr(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _says_depth(name: str) -> bool:
+    if _NO_DEPTH.search(name):
+        return False
     return name.rpartition(".")[2].lower() in ("z", "depth") or "depth" in name.lower()
 
 
