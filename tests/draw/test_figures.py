@@ -92,6 +92,7 @@ def test_bars_leave_undefined_numbers_out(saved: list[Figure], tmp_path: Path) -
     assert [bar.get_width() for bar in first.patches] == [50, 0, 120, 10] and first.get_xlim()[1] > 120
     assert cut.get_xlim() == (0, 100)
     assert sum(bar.get_height() for bar in counted.patches) == 3 and len(counted.patches) == 20
+    assert first.get_ylim() == (1.6, -0.6) and all(tick == int(tick) for tick in counted.get_yticks())
     with pytest.raises(DataError, match="cannot be written"):
         draw_panels(panels, 2, "Parts", tmp_path / "no" / "b.png")
 
