@@ -62,7 +62,7 @@ class Histogram:
         from matplotlib.ticker import MaxNLocator
 
         axes.hist(self.values[~np.isnan(self.values)], bins=np.linspace(0, self.most, 21), color="#4c72b0")
-        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.set_box_aspect(0.75)
         axes.set_anchor("N")
         axes.set_xlabel(self.unit)

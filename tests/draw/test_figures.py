@@ -66,6 +66,12 @@ def test_a_log_without_numbers_is_drawn(saved: list[Figure], tmp_path: Path) -> 
     assert not saved[0].axes[0].get_lines()
 
 
+def test_one_epoch_has_one_whole_tick(saved: list[Figure], tmp_path: Path) -> None:
+    draw_learning_curves([{"epoch": 1, "x": 0.5}], [Panel("one", [Curve("x", "x")])], tmp_path / "a.png", "epoch")
+    low, high = saved[0].axes[0].get_xlim()
+    assert [tick for tick in saved[0].axes[0].get_xticks() if low <= tick <= high] == [1]
+
+
 def test_a_confusion_matrix_shows_counts_and_shares(saved: list[Figure], tmp_path: Path) -> None:
     counts = np.array([[3, 1, 0], [0, 2, 0], [0, 0, 0]])
     draw_confusion(
