@@ -353,11 +353,12 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
             f"{path}: holds a table{f' ({first_names(tables, 5)})' if any(tables) else ''}, not an array of clouds; write it as .csv or"
             " .parquet (pandas: DataFrame.to_csv), and give --frame-column, or --track columns where a row is a frame"
         )
-    flat = [one for one in arrays.values() if not isinstance(one, list) and one.ndim == 2]
+    dense = [one for one in arrays.values() if not isinstance(one, list)]
+    flat = [one.ndim for one in dense if one.ndim >= 2 and sum(length > 1 for length in one.shape) <= 2]
     if flat and not axes:
         raise DataError(
             f"{path}: one cloud, or none, in {first_names(shapes, 5)}; expected (frames, points, 3), or a folder whose files are the"
-            " frames"
+            f" frames{'; --axes, such as TNC, makes a sequence of one frame of it' if max(flat) == 3 else ''}"
         )
     wanted = (
         f"{len(axes)} axes (--axes {axes})" if axes else "shape (frames, points, 3) or (sequences, frames, points, 3)"
