@@ -39,7 +39,7 @@ class Bars:
             offset = (number - (len(self.values) - 1) / 2) * height
             axes.barh(places + offset, np.nan_to_num(lengths), height, label=name)
         axes.set_yticks(places, self.titles, fontsize=8, parse_math=False)
-        axes.invert_yaxis()
+        axes.set_ylim(len(self.titles) - 0.4, -0.6)
         axes.grid(axis="x", color="#e4e8ee", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(self.values), frameon=False)
@@ -59,7 +59,12 @@ class Histogram:
 
     def draw(self, axes: Axes) -> None:
         """Draws the histogram on matplotlib's axes."""
+        from matplotlib.ticker import MaxNLocator
+
         axes.hist(self.values[~np.isnan(self.values)], bins=np.linspace(0, self.most, 21), color="#4c72b0")
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.set_box_aspect(0.75)
+        axes.set_anchor("N")
         axes.set_xlabel(self.unit)
         axes.set_ylabel(self.counted)
 

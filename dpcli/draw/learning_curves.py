@@ -59,7 +59,7 @@ def draw_learning_curves(rows: Sequence[Mapping[str, Any]], panels: Sequence[Pan
         lines = _plot(axes, own, panel.curves, x)
         axes.set(title=panel.title, xlabel=x, ylabel=panel.y_label, yscale="log" if panel.logarithmic else "linear")
         axes.set_ylim(*panel.range)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         if panel.change is not None:
             axes.axvline(panel.change, color="0.6", linestyle=":")
         if panel.right:

@@ -29,13 +29,14 @@ class Look:
     """Holds how parts are drawn.
 
     cell: pixels of a picture's side. up: the axis that points upwards, such as z or -y. azimuth, elevation: of the
-    camera, radians.
+    camera, radians. gray: what the legend calls the points of part -1.
     """
 
     cell: int = 200
     up: str = "z"
     azimuth: float = _AZIMUTH
     elevation: float = _ELEVATION
+    gray: str = "?"
 
     def __post_init__(self) -> None:
         if self.up not in ("x", "y", "z", "-x", "-y", "-z"):
@@ -86,19 +87,20 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) 
     draw = ImageDraw.Draw(sheet)
     for place, (title, part, cells) in enumerate(rows):
         top = _GAP + place * step
-        room = _legend(draw, top, sheet.width - _GAP, part)
+        room = _legend(draw, top, sheet.width - _GAP, part, look.gray)
         write_line(draw, (_GAP, top + 3), title, room - 2 * _GAP, LIGHT.ink)
         for column, cell in enumerate(cells):
             sheet.paste(Image.fromarray(cell), (_GAP + column * look.cell, top + _TITLE))
     return sheet
 
 
-def _legend(draw: Any, top: int, right: int, part: np.ndarray) -> int:
+def _legend(draw: Any, top: int, right: int, part: np.ndarray, gray: str) -> int:
     """Draws swatches of the parts with their share of the points, right-aligned, on half the row; returns where they start."""
     ids, counts = np.unique(part, return_counts=True)
     font, start, left = text_font(11), right // 2, right
     for own, count in reversed(list(zip(ids.tolist(), counts.tolist(), strict=True))):
-        text = f"{'?' if own < 0 else own}: {100 * count / len(part):.0f} %"
+        percent = round(100 * count / len(part))
+        text = f"{gray if own < 0 else own}: {percent or '<1'} %"
         width = int(draw.textlength(text, font=font)) + 20
         if left - width < start:
             draw.text((left - 14, top + 4), "…", fill=LIGHT.ink, font=font)

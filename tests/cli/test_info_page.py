@@ -478,14 +478,19 @@ def test_scores_that_are_no_probabilities_are_called_scores(tmp_path, dpc_here):
 
 @needs_browser
 def test_an_embedding_is_a_scatter(tmp_path, dpc_here):
-    labels = np.repeat([0, 1], 40)
-    spots = (np.where(labels[:, None] == 0, -5, 5) + np.random.default_rng(0).normal(size=(80, 2))).astype(np.float32)
-    names = [f"v{at}" for at in range(80)]
+    labels = np.repeat([0, 1, 14], [40, 40, 1])  # the colors begin anew at 14, with another shape
+    spots = np.array([[-5, -5], [5, 5], [5, -5]])[np.repeat([0, 1, 2], [40, 40, 1])].astype(np.float32)
+    spots[:80] += np.random.default_rng(0).normal(size=(80, 2))
+    names, classes = [f"v{at}" for at in range(81)], ["low", "high", *map(str, range(2, 15))]
     stream = StreamEmbedding(spots, spots, {"accuracy": 0.9})
-    write_embedding(tmp_path / "e.h5", names, labels, ["test"] * 80, {"static": stream}, class_names=["low", "high"])
+    write_embedding(tmp_path / "e.h5", names, labels, ["test"] * 81, {"static": stream}, class_names=classes)
     assert dpc_here("info", tmp_path / "e.h5", "--page", tmp_path / "e.html").returncode == 0
+    assert [one["shape"] for one in header_of(tmp_path / "e.html")["classes"]] == ["circle", "circle", "square"]
     shown = show(tmp_path / "e.html", tmp_path, "theme=light")
-    blue, orange = (np.argwhere(near(shown.pixels[:, :640], color)).mean(0) for color in (BLUE, ORANGE))
+    pixels = np.argwhere(near(shown.pixels[:, :640], BLUE))
+    alone = pixels[:, 1] > pixels[:, 1].mean() + 100
+    assert np.prod(np.ptp(pixels[alone], axis=0) + 1) == alone.sum()  # a square has corners
+    blue, orange = pixels[~alone].mean(0), np.argwhere(near(shown.pixels[:, :640], ORANGE)).mean(0)
     assert blue[0] > orange[0] + 100 and blue[1] < orange[1] - 100  # low: left and at the bottom
     assert "accuracy 0.9" in shown.html
 

@@ -66,6 +66,12 @@ def test_a_log_without_numbers_is_drawn(saved: list[Figure], tmp_path: Path) -> 
     assert not saved[0].axes[0].get_lines()
 
 
+def test_one_epoch_has_one_whole_tick(saved: list[Figure], tmp_path: Path) -> None:
+    draw_learning_curves([{"epoch": 1, "x": 0.5}], [Panel("one", [Curve("x", "x")])], tmp_path / "a.png", "epoch")
+    low, high = saved[0].axes[0].get_xlim()
+    assert [tick for tick in saved[0].axes[0].get_xticks() if low <= tick <= high] == [1]
+
+
 def test_a_confusion_matrix_shows_counts_and_shares(saved: list[Figure], tmp_path: Path) -> None:
     counts = np.array([[3, 1, 0], [0, 2, 0], [0, 0, 0]])
     draw_confusion(
@@ -92,6 +98,7 @@ def test_bars_leave_undefined_numbers_out(saved: list[Figure], tmp_path: Path) -
     assert [bar.get_width() for bar in first.patches] == [50, 0, 120, 10] and first.get_xlim()[1] > 120
     assert cut.get_xlim() == (0, 100)
     assert sum(bar.get_height() for bar in counted.patches) == 3 and len(counted.patches) == 20
+    assert first.get_ylim() == (1.6, -0.6) and all(tick == int(tick) for tick in counted.get_yticks())
     with pytest.raises(DataError, match="cannot be written"):
         draw_panels(panels, 2, "Parts", tmp_path / "no" / "b.png")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from PIL import Image
 from dpcli.draw.palette import PALETTE
 from dpcli.draw.ply import write_ply, write_ply_frames
 from dpcli.errors import DataError, UsageError
-from dpcli.segment.pictures import Look, parts_picture, there_and_back, turntable
+from dpcli.segment.pictures import Look, _legend, parts_picture, there_and_back, turntable
 from dpcli.store import CloudSequence
 
 WHITE = (255, 255, 255)
@@ -63,6 +64,17 @@ def test_odd_sequences_are_drawn(tmp_path: Path) -> None:
     parts_picture(tmp_path / "a.png", [point, gap, many])
     image = np.asarray(Image.open(tmp_path / "a.png"))
     assert tuple(image[0, 0]) == WHITE
+
+
+def test_the_legend_names_what_stands_and_what_has_few_points() -> None:
+    told: list[str] = []
+    draw = SimpleNamespace(
+        textlength=lambda text, font: 6 * len(text),
+        ellipse=lambda box, fill: None,
+        text=lambda place, text, **_look: told.append(text),
+    )
+    _legend(draw, 0, 800, np.repeat([-1, 1, 2], [700, 298, 2]), "0, stands")
+    assert told == ["2: <1 %", "1: 30 %", "0, stands: 70 %"]
 
 
 def test_turntable(sequence: CloudSequence, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""An embedding as a page: a plane for each stream, a dot for each sample, a color for each class."""
+"""An embedding as a page: a plane for each stream, a dot for each sample, a color and a shape for each class."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 
 from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts
-from dpcli.draw.palette import part_colors
+from dpcli.draw.palette import PALETTE, part_colors
 from dpcli.draw.sheet import spread_evenly
 
 MOST_DOTS = 20_000
+_SHAPES = ("circle", "square", "diamond")  # the next one where the colors begin anew
 
 
 def scatter_page(
@@ -30,6 +31,7 @@ def scatter_page(
         {
             "label": label,
             "color": part_colors(np.array([label]))[0].tolist(),
+            "shape": _SHAPES[max(label, 0) // len(PALETTE) % len(_SHAPES)],
             "name": "unknown"
             if label < 0
             else class_names[label]

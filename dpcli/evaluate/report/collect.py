@@ -228,12 +228,13 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
 
 
 def _video_result(path: Path, truth: Path | None, pictures: bool) -> CollectedResult:
+    from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.video.comparison import evaluate_video
     from dpcli.evaluate.video.result_json import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
-    result = _collected(video_json(evaluate_video(path, truth), str(path)), path)
+    result = _collected(video_json(evaluate_video(path, truth, resampling=Resampling()), str(path)), path)
     if pictures:
         _add_strips(result)
     return result

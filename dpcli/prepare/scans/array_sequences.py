@@ -305,11 +305,11 @@ def _refuse(path: Path, arrays: Mapping[str, Any], axes: str) -> list[Source]:
     advice = "" if axes else rows_of_axes(arrays, timed=False) or frames_beside(arrays, totals)
     if advice:
         raise DataError(f"{path}: {advice}")
-    flat = [one for one in plain.values() if one.ndim == 2]
+    flat = [one.ndim for one in plain.values() if one.ndim >= 2 and sum(length > 1 for length in one.shape) <= 2]
     if flat and not axes:
         raise DataError(
             f"{path}: one cloud, or none, in {first_names(shapes, 5)}; expected (frames, points, 3), or a folder whose files are the"
-            " frames"
+            f" frames{'; --axes, such as TNC, makes a sequence of one frame of it' if max(flat) == 3 else ''}"
         )
     wanted = (
         f"{len(axes)} axes (--axes {axes})" if axes else "shape (frames, points, 3) or (sequences, frames, points, 3)"

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -64,11 +65,11 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
             "supervised": supervised and not predicted,
             **({"labels": "predicted"} if predicted else {}),
             "flow": settings.run.flow,
-            "trained_on": f"{len(learned)} sequences, {len(training.pairs)} pairs",
+            "trained_on": f"{counted(len(learned), 'sequence')}, {counted(len(training.pairs), 'pair')}",
         }
         log.info(
-            f"training on {chosen}: {notes['trained_on']}, {len(held)} sequences for validation;"
-            f" {settings.schedule.epochs} epochs"
+            f"training on {chosen}: {notes['trained_on']}, {counted(len(held), 'sequence')} for validation;"
+            f" {counted(settings.schedule.epochs, 'epoch')}"
         )
         keep_freed_memory()
         estimate = partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow), device=str(chosen))

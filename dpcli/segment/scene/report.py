@@ -82,4 +82,5 @@ def picture_of_scene(sequence: CloudSequence, length_unit: str) -> tuple[CloudSe
     axis = int(np.abs(up).argmax())
     sequence.take_points(shown, offsets)
     sequence.part = np.where(sequence.part == 0, -1, sequence.part).astype(np.int16)
-    return sequence, Look(cell=420, up=("-" if up[axis] < 0 else "") + "xyz"[axis], elevation=np.deg2rad(50.0))
+    upwards = ("-" if up[axis] < 0 else "") + "xyz"[axis]
+    return sequence, Look(cell=420, up=upwards, elevation=np.deg2rad(50.0), gray="0, stands")

@@ -423,6 +423,16 @@ def test_a_video_has_its_pictures_in_the_page(tmp_path):
     assert "not where the object says" in gone.results[0].notes[0]
 
 
+def test_a_video_of_several_views_has_an_interval(tmp_path):
+    frames = np.random.default_rng(2).integers(0, 99, (3, 2, 24, 24, 3), np.uint8)
+    np.save(tmp_path / "ours.npy", frames + np.arange(1, 4, dtype=np.uint8).reshape(3, 1, 1, 1, 1))
+    np.save(tmp_path / "theirs.npy", frames)
+    found = collect([f"{tmp_path / 'ours.npy'}={tmp_path / 'theirs.npy'}"], pictures=False)
+    low, high = map(float, arrange(found).summary.rows[0][4].text.split(" to "))
+    # errors of 1, 2 and 3 of 255
+    assert 20 * np.log10(255 / 3) - 0.1 < low < high < 20 * np.log10(255) + 0.1
+
+
 def test_the_command(scores, tmp_path):
     run = partial(evaluate, "report")
     page = tmp_path / "r.html"

@@ -199,6 +199,14 @@ def test_triangles_and_colors_without_names_are_no_frames(tmp_path, capsys, form
     assert [len(frame) for frame in read(clip)["whole"]] == [70, 35]
 
 
+def test_one_frame_alone_is_told_apart_by_axes(tmp_path, capsys):
+    np.save(tmp_path / "one.npy", np.random.default_rng(3).normal(size=(1, 40, 3)))
+    with pytest.raises(DataError, match="refused"):
+        read(tmp_path / "one.npy")
+    assert "one cloud, or none, in an array (1, 40, 3)" in (said := capsys.readouterr().err) and "--axes" in said
+    assert [len(frame) for frame in read(tmp_path / "one.npy", "--axes", "TNC")["one"]] == [40]
+
+
 def test_colors_that_the_first_file_lacks_are_told(tmp_path, capsys):
     for name, more in (("a", {}), ("b", {"colors": np.zeros((5, 30, 3), np.uint8)})):
         write(tmp_path / "raw" / name, "npz", points=untracked(13, 5, 30), **more)

@@ -318,7 +318,7 @@ def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
     count = len(picture_of_scene(copy.copy(sequence), "m")[0].points)
     sequence.points = 1000 * sequence.points
     shown, look = picture_of_scene(sequence, "mm")
-    assert look.up == "z" and shown.frame_offsets[1] == 0 < len(shown.points) == count
+    assert look.up == "z" and look.gray == "0, stands" and shown.frame_offsets[1] == 0 < len(shown.points) == count
 
 
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():

@@ -38,8 +38,8 @@ class ScatterPage {
     return plane;
   }
 
-  entry({ label, name, color }) {
-    const button = made("button", "", { "aria-pressed": true, title: "show or hide" }), mark = made("i");
+  entry({ label, name, color, shape }) {
+    const button = made("button", "", { "aria-pressed": true, title: "show or hide" }), mark = made("i", "", { class: shape });
     mark.style.background = `rgb(${color})`;
     button.append(mark, made("b", name), made("span", this.header.labels.filter((one) => one === label).length.toLocaleString("en")));
     button.onclick = () => {
@@ -86,10 +86,16 @@ class ScatterPage {
   }
 
   dot(pen, [x, y], row, size, alpha) {
-    pen.fillStyle = `rgba(${this.classOf.get(this.header.labels[row]).color},${alpha})`;
+    const { color, shape } = this.classOf.get(this.header.labels[row]);
+    pen.fillStyle = `rgba(${color},${alpha})`;
     pen.strokeStyle = getComputedStyle(root).getPropertyValue("--stage");
     pen.beginPath();
-    pen.arc(x, y, size, 0, 2 * Math.PI);
+    if (shape === "circle") pen.arc(x, y, size, 0, 2 * Math.PI);
+    else for (const quarter of [0, 1, 2, 3]) {
+      const angle = (quarter + (shape === "square") / 2) * Math.PI / 2, far = 1.25 * size; // as much area as the circle
+      pen.lineTo(x + far * Math.cos(angle), y + far * Math.sin(angle));
+    }
+    pen.closePath();
     pen.fill();
     pen.stroke();
   }
