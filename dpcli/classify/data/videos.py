@@ -33,7 +33,7 @@ def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name:
     if not chosen:
         raise DataError(f"{reader.path}: no sample of split {wanted!r}; it has {sorted(set(reader.splits))}")
     if split == "auto":
-        log.info(f"scoring split {wanted!r}: {len(chosen)} of {counted(len(reader), 'video')} (--split chooses)")
+        log.info(f"split {wanted!r}: {len(chosen)} of {counted(len(reader), 'video')} (--split chooses)")
         _tell_trained(reader, chosen, model_name)
     return chosen
 

@@ -308,6 +308,8 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
                 sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
                 look = looks[0]
             parts_picture(drawings.picture, sequences, look=look)
+            if len(shown) < len(reader):
+                log.info(f"{drawings.picture}: shows {len(shown)} of {len(reader)} sequences, evenly chosen")
         if drawings.turntable is not None:
             turntable(drawings.turntable, reader.read(0))
         if drawings.ply is not None:
