@@ -98,8 +98,10 @@ class OwnScans:
         Lengths(self.scale, self.unit)
 
     def _in_folders(self) -> tuple[list[str], str]:
-        """Returns what `labels_of_folders` takes: the names of the samples, and what each holds at least."""
-        raise NotImplementedError
+        """Returns what `labels_of_folders` takes: the names of the samples, and what each holds at least. Raises UsageError for
+        data that lie in no folders.
+        """
+        raise UsageError(f"{self.raw}: lies in no folder of its class; leave out --label-from-folder")
 
     @cached_property
     def _table(self) -> LabelTable:
