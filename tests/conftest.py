@@ -25,6 +25,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # the workers take the cores: more thre
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Runs the kernels' own tests first: each kernel is compiled once, and then lies on disk for all workers."""
+    items.sort(key=lambda item: "ops" not in item.path.parts)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real data sets beside the project; tests that need them are skipped where they are absent."""

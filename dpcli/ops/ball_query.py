@@ -138,18 +138,22 @@ def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device, 
 def _query_numba(query: _Query) -> tuple[torch.Tensor, torch.Tensor]:
     from dpcli.ops.cpu.neighbor_search import balanced_query_kernel, ball_query_kernel
 
-    points, *rest, k, order = query
+    points, times, *rest, k, order = query
     batch, rows = query.centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)
     count = torch.empty((batch, rows), dtype=torch.int64)
+    xyz = np.ascontiguousarray(points.numpy().transpose(0, 2, 1))  # torch's copy would wake OpenMP threads
+    when = times.contiguous().numpy()
+    arrays = [tensor.contiguous().numpy() for tensor in rest]
     if order == "balanced":
-        kernel, xyz = balanced_query_kernel, points.contiguous().numpy()
-        choice = np.array(balanced_shares(k, len(query.limits) - 1), np.int64)
+        by_time = np.argsort(when, 1, kind="stable")  # within a frame the lowest index stays first
+        if (np.diff(when) < 0).any():
+            xyz, when = np.take_along_axis(xyz, by_time[:, None], 2), np.take_along_axis(when, by_time, 1)
+        shares = np.array(balanced_shares(k, len(query.limits) - 1), np.int64)
+        kernel, arrays = balanced_query_kernel, [*arrays, shares, by_time]
     else:
-        kernel, choice = ball_query_kernel, order == "nearest"
-        xyz = np.ascontiguousarray(points.numpy().transpose(0, 2, 1))  # torch's copy would wake OpenMP threads
-    arrays = (tensor.contiguous().numpy() for tensor in rest)
-    run_in_threads(kernel, (xyz, *arrays, choice, index.numpy(), count.numpy()), batch * rows, _ROW_NS[order])
+        kernel, arrays = ball_query_kernel, [*arrays, order == "nearest"]
+    run_in_threads(kernel, (xyz, when, *arrays, index.numpy(), count.numpy()), batch * rows, _ROW_NS[order])
     return index, count
 
 

@@ -75,7 +75,9 @@ def _morton_order(points, n):
 @kernel
 def _fill_buckets(points, n, order, xyz, box):
     """Sorts points[:n] into buckets: order (n,), xyz (3, buckets*BUCKET) and box (6, buckets); see `bucket_kernel`."""
-    order[:n] = _morton_order(points, n)
+    along = _morton_order(points, n)
+    for i in range(n):
+        order[i] = along[i]
     for b in range((n + BUCKET - 1) // BUCKET):
         first = b * BUCKET
         for axis in range(3):
@@ -113,7 +115,8 @@ def _group_boxes(box, buckets, out):
     """Computes the bounding boxes of the groups, out (6, groups), from the boxes of `buckets` buckets."""
     for group in range(out.shape[1]):
         first = group * GROUP
-        out[:, group] = box[:, first]
+        for row in range(6):
+            out[row, group] = box[row, first]
         for b in range(first + 1, min(first + GROUP, buckets)):
             for axis in range(3):
                 out[2 * axis, group] = min(out[2 * axis, group], box[2 * axis, b])

@@ -113,6 +113,7 @@ def kernel(function: Callable) -> Callable:
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
     mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
     in the file of the kernel that calls them: the cache looks for changes in that file and in those of `_SHARED` only.
+    A slice takes single numbers, arrays are copied by a loop: numba's check of shapes is compiled for five seconds.
     """
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
 

@@ -236,34 +236,22 @@ def _frame_share(x, y, z, times, centroid, t, limit, block, part):
 
 
 @kernel
-def _balanced_clip(points, times, centroids, centroid_times, limits, shares, low_row, high_row, index, count):
-    in_order = _is_sorted(times)
-    order = np.empty(0, np.int64)
-    if not in_order:
-        order = np.argsort(times, kind="mergesort")  # stable: within a frame the lowest index stays first
-        points, times = points[order], times[order]
-    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
-    block = np.empty(_BLOCK + 1, np.float32)
-    for m in range(low_row, high_row):
-        row = index[m]
-        count[m] = _balanced_row(x, y, z, times, centroids[m], centroid_times[m], limits, shares, block, row)
-        for slot in range(row.size):
-            if row[slot] < 0:
-                row[slot] = 0
-            elif not in_order:
-                row[slot] = order[row[slot]]
+def balanced_query_kernel(xyz, times, centroids, centroid_times, limits, shares, order, index, count, first, last):
+    """Fills rows as `ball_query_kernel` does, but slots are shared among frames: shares (2R-1,) i64.
 
-
-@kernel
-def balanced_query_kernel(points, times, centroids, centroid_times, limits, shares, index, count, first, last):
-    """Fills rows as `ball_query_kernel` does, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
+    times are sorted and the points in their order, the point of column i being named order[b, i] i64 in the index.
+    """
     rows = centroids.shape[1]
+    block = np.empty(_BLOCK + 1, np.float32)
     while first < last:
         b = first // rows
         low, high = first - b * rows, min(last - b * rows, rows)
-        _balanced_clip(
-            points[b], times[b], centroids[b], centroid_times[b], limits, shares, low, high, index[b], count[b]
-        )
+        x, y, z, when = xyz[b, 0], xyz[b, 1], xyz[b, 2], times[b]
+        for m in range(low, high):
+            row, t = index[b, m], centroid_times[b, m]
+            count[b, m] = _balanced_row(x, y, z, when, centroids[b, m], t, limits, shares, block, row)
+            for slot in range(row.size):
+                row[slot] = order[b, row[slot]] if row[slot] >= 0 else 0
         first += high - low
 
 

@@ -370,7 +370,8 @@ def assign_kernel(cost, neighbors, label, extra, border, rounds):
                     best = k
             new[i] = best
             changed = changed or best != label[i]
-        label[:] = new
+        for i in range(count):
+            label[i] = new[i]
         if not changed:
             break
 

@@ -84,8 +84,8 @@ def alike_kernel(points, starts, motions, width, hinge, alike, away):
                 value = hinge * math.exp(-exponent) if exponent < _ALONE else 0.0
                 alike[i, k, other] = value
                 alike[i, other, k] = value
-            if other == 0:
-                away[:, k] = gap
+                if other == 0:
+                    away[i, k] = gap[i]
 
 
 @inlined
