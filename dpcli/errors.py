@@ -44,6 +44,15 @@ class Stopped(DpcError):
     exit_code = 75
 
 
+def first_line(error: BaseException) -> str:
+    """Returns the first line of what a library's error says, or its type where it says nothing.
+
+    >>> first_line(ValueError("no number\nat line 3")), first_line(KeyError())
+    ('no number', 'KeyError')
+    """
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
 @contextmanager
 def reading(where: object) -> Iterator[None]:
     """Turns whatever a library raises in the block into DataError that names `where`, the file or sample, and its type.

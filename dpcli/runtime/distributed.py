@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 import torch.distributed as dist
 
-from dpcli.errors import DpcError, UsageError
+from dpcli.errors import DpcError, UsageError, first_line
 from dpcli.runtime.progress import log
 
 _LOST = ("Connection closed", "Connection reset", "Broken pipe", "peer", "NCCL", "Timed out", "timed out")
@@ -80,7 +80,7 @@ def process_group(device: torch.device) -> Iterator[Processes]:
         dist.init_process_group(kind)
     except (RuntimeError, ValueError) as error:
         raise DpcError(
-            f"process {processes.rank} of {processes.count} could not reach the others: {str(error).splitlines()[0]};"
+            f"process {processes.rank} of {processes.count} could not reach the others: {first_line(error)};"
             f" start them with torchrun, and name the network to use in {kind.upper()}_SOCKET_IFNAME if there are several"
         ) from None
     try:
@@ -89,7 +89,7 @@ def process_group(device: torch.device) -> Iterator[Processes]:
         if not any(word in str(error) for word in _LOST):
             raise
         raise DpcError(
-            f"process {processes.rank} of {processes.count} lost the others ({str(error).splitlines()[0]});"
+            f"process {processes.rank} of {processes.count} lost the others ({first_line(error)});"
             " run again to continue from the last epoch that was saved"
         ) from None
     finally:

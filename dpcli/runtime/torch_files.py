@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, first_line
 from dpcli.npy_files import require_distinct
 
 
@@ -25,9 +25,8 @@ def load_plain(path: Path) -> Any:
     except DataError:
         raise
     except Exception as error:  # pickle, zip and torch each have their own
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(
-            f"{path}: not a file of plain tensors, or not whole ({reason[:120]}); it was not loaded"
+            f"{path}: not a file of plain tensors, or not whole ({first_line(error)[:120]}); it was not loaded"
         ) from None
     for value in _leaves(found):
         if isinstance(value, torch.Tensor) and (fault := _fault(value)):

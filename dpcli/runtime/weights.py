@@ -16,7 +16,7 @@ from dpcli import __version__
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import utf8_path
 from dpcli.regular_files import why_unreadable
-from dpcli.runtime.settings.stored import from_json, json_value
+from dpcli.runtime.settings.stored import StoredConfig, from_json, json_value
 from dpcli.runtime.settings.value_types import numbers_in
 from dpcli.runtime.whole_file import write_whole
 
@@ -95,6 +95,23 @@ def _with_sorted_header(content: bytes) -> bytes:
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([content[:8], text.ljust(length), content[8 + length :]]) if len(text) <= length else content
+
+
+def network_header(file_format: str, config: StoredConfig, notes: dict[str, Any]) -> dict[str, str]:
+    """Returns the header of a network's weights file: its configuration, and notes, a small JSON object."""
+    return {"format": file_format, "config": config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
+
+
+def load_network(
+    path: Path, expected_format: str, maker: str, config: type[Kind], make: Callable[[Kind], Network]
+) -> tuple[Network, dict[str, Any]]:
+    """Returns the network of a weights file with a `network_header`, in eval mode, and its notes.
+
+    make: builds it of its configuration. Raises DataError as `load_weights` and `fill_network`, and for a damaged header.
+    """
+    tensors, header = load_weights(path, expected_format, maker)
+    sizes, notes = header_settings(path, header, config), header_value(path, header, "notes", dict)
+    return fill_network(lambda: make(sizes), tensors, path), notes
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from dpcli import __version__
-from dpcli.errors import DataError, reading
+from dpcli.errors import DataError, first_line, reading
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_folder, refuse_pipe
 from dpcli.store.heap_check import check_heaps
@@ -82,7 +82,7 @@ def _opening_problem(path: Path, error: Exception) -> str:
         return f"{path}: the HDF5 file is truncated ({path.stat().st_size} bytes are left); make or copy it again"
     if "unable to lock file" in text:  # not any "lock": there is a superblock, too
         return f"{path}: locked by a writer, or on a file system without locks (then set HDF5_USE_FILE_LOCKING=FALSE)"
-    return f"{path}: the HDF5 file is damaged ({text.splitlines()[0] if text else type(error).__name__}); make or copy it again"
+    return f"{path}: the HDF5 file is damaged ({first_line(error)}); make or copy it again"
 
 
 def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:

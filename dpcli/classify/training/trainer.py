@@ -22,7 +22,7 @@ from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.optimizer_step import StageStep, watch_of
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.validation import validation_accuracy
-from dpcli.errors import DpcError
+from dpcli.errors import DpcError, first_line
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
@@ -144,7 +144,7 @@ class Trainer:
                 raise
             self._save_state(together=False)
             raise DpcError(
-                f"a process that loads clips was killed, perhaps for lack of memory ({str(error).splitlines()[0]});"
+                f"a process that loads clips was killed, perhaps for lack of memory ({first_line(error)});"
                 f" saved at epoch {self.epoch + 1}, step {self.step}: run again to continue, with fewer workers"
                 " (--set workers=0)"
             ) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -157,6 +156,5 @@ def _names(scores: ScoresReader, chosen: np.ndarray) -> list[str]:
 
 def _streams(scores: ScoresReader) -> dict[str, np.ndarray]:
     """Returns single streams in the order they are trained (static, dynamic, others), then the main scores."""
-    order: Sequence[str] = sorted(scores.streams, key=lambda name: (name != "static", name != "dynamic", name))
-    single = {name: scores.streams[name] for name in order if name != FUSED}
+    single = {name: scores.streams[name] for name in scores.stream_names if name != FUSED}
     return {**single, FUSED if single else "scores": scores.scores}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError, first_line
 from dpcli.evaluate.networks import full_precision
 from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
 from dpcli.evaluate.networks.weights import whole_weights
@@ -74,8 +74,9 @@ def _model(folder: Path) -> Any:
     try:
         return CLIPVisionModelWithProjection(CLIPVisionConfig.from_pretrained(folder, local_files_only=True))
     except (OSError, ValueError, TypeError) as error:
-        reason = str(error).strip().splitlines()[0][:150]
-        raise DataError(f"{folder / 'config.json'}: not the configuration of a CLIP ({reason})") from None
+        raise DataError(
+            f"{folder / 'config.json'}: not the configuration of a CLIP ({first_line(error)[:150]})"
+        ) from None
 
 
 def preprocess(

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, first_line
 
 CLASSES = 400
 # channels in -> 1x1x1; 1x1x1, 3x3x3; 1x1x1, 3x3x3; 1x1x1 behind the pool (table 1 of Szegedy et al. 2015)
@@ -143,7 +143,7 @@ class ScriptedI3D(nn.Module):
         try:
             self.script = torch.jit.load(str(path), map_location="cpu").eval()
         except (RuntimeError, ValueError) as error:
-            raise DataError(f"{path}: not a TorchScript file ({str(error).splitlines()[0][:150]})") from None
+            raise DataError(f"{path}: not a TorchScript file ({first_line(error)[:150]})") from None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Returns the logits (B,400) of `x` f32 (B,3,T,224,224) in -1..1."""

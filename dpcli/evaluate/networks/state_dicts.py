@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, first_line
 from dpcli.runtime.torch_files import load_plain
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def _read(path: Path) -> Any:
     except DataError:
         raise
     except Exception as error:  # safetensors and torch each have their own
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise DataError(f"{path}: not a plain state dict, or not whole ({reason[:150]})") from None
+        raise DataError(f"{path}: not a plain state dict, or not whole ({first_line(error)[:150]})") from None
 
 
 def _tensors(found: Any) -> dict[str, torch.Tensor] | None:

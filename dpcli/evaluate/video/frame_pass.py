@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,6 +18,7 @@ from dpcli.evaluate.video.picture_statistics import PictureMetrics, PictureStati
 from dpcli.evaluate.video.protocol import VideoProtocol, check_size, scaled, score_frame
 from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.evaluate.video.sources.stored import SceneSource
+from dpcli.runtime.device import cpu_count
 from dpcli.runtime.progress import Progress
 
 _RATE = 0.01  # how far apart two rates are the same
@@ -301,7 +301,7 @@ def _multiplied_by_alpha(picture: Picture, other: np.ndarray) -> bool:
 
 def in_threads(work: Iterator[Callable[[], PictureStatistics]], progress: Progress) -> Iterator[PictureStatistics]:
     """Yields the results in order; reading goes on while earlier frames are scored, a few pictures in memory at a time."""
-    workers = max(1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1))
+    workers = min(8, cpu_count())
     waiting: deque[Future] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for job in work:

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, first_line
 from dpcli.runtime.torch_files import check_members, load_plain
 
 EXAMPLE_ID = "ashawkey/zero123-xl-diffusers"
@@ -157,9 +157,8 @@ def _hub_folder(model: str, half: bool) -> Path:
     try:
         return Path(hub.snapshot_download(model, allow_patterns=_needed(hub.HfApi().list_repo_files(model), half)))
     except Exception as error:  # likewise: its own classes, or those of one of two HTTP libraries
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(
-            f"--prior-model {model}: no such folder, and it couldn't be fetched from the hub ({reason}). On a machine"
+            f"--prior-model {model}: no such folder, and it couldn't be fetched from the hub ({first_line(error)}). On a machine"
             f" with network: `hf download {model} --local-dir FOLDER`; then --prior-model FOLDER"
         ) from None
 
@@ -188,7 +187,7 @@ def _network(library: str, name: str, folder: Path, half: bool, **options: Any) 
             folder, output_loading_info=True, **options
         )
     except Exception as error:  # damaged JSON, cut files, wrong shapes: each has its own class in each library
-        raise DataError(f"{folder / file}: can't be loaded as {name} ({_first_line(error)})") from None
+        raise DataError(f"{folder / file}: can't be loaded as {name} ({first_line(error)})") from None
     if absent := sorted(report["missing_keys"]):  # the libraries fill them with random numbers
         raise DataError(f"{folder / file}: {len(absent)} of {name}'s tensors are absent, {absent[0]!r} for one")
     return network
@@ -205,7 +204,7 @@ def _camera_projection(folder: Path, half: bool) -> torch.nn.Linear:
     except DataError:
         raise
     except Exception as error:  # as above
-        raise DataError(f"{folder / file}: expected tensors proj.weight and proj.bias ({_first_line(error)})") from None
+        raise DataError(f"{folder / file}: expected tensors proj.weight and proj.bias ({first_line(error)})") from None
     if weight.ndim != 2 or bias.shape != weight.shape[:1]:
         raise DataError(
             f"{folder / file}: proj.weight {tuple(weight.shape)} and proj.bias {tuple(bias.shape)} don't fit"
@@ -223,7 +222,7 @@ def _noise_schedule(folder: Path) -> torch.Tensor:
         predicts = json.loads(path.read_text()).get("prediction_type", "epsilon")
         schedule = DDIMScheduler.from_pretrained(folder, local_files_only=True).alphas_cumprod
     except Exception as error:
-        raise DataError(f"{path}: not a scheduler's configuration ({_first_line(error)})") from None
+        raise DataError(f"{path}: not a scheduler's configuration ({first_line(error)})") from None
     if predicts != "epsilon":
         raise DataError(f"{path}: prediction_type {predicts!r}, expected 'epsilon', which Zero123 predicts")
     return schedule.float()
@@ -242,7 +241,3 @@ def _check_sizes(model: Zero123Model, folder: Path) -> None:
             raise DataError(
                 f"--prior-model {folder}: {what} is {value}, expected {expected}; this is not a Zero123 model"
             )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

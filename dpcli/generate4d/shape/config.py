@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from dpcli.runtime.settings.fields import WIDEST, check, setting
-from dpcli.runtime.settings.stored import from_json
+from dpcli.runtime.settings.stored import StoredConfig
 
 
 @dataclass(frozen=True)
-class ShapeConfig:
+class ShapeConfig(StoredConfig):
     """Holds the sizes of a shape network."""
 
     widths: tuple[int, ...] = setting(
@@ -25,12 +24,3 @@ class ShapeConfig:
 
     def __post_init__(self) -> None:
         check(self)
-
-    def to_json(self) -> str:
-        """Returns the text that a weights file keeps."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> ShapeConfig:
-        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
-        return from_json(cls, text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from dpcli.errors import DataError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.network import ShapeNetwork
-from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_network, network_header, save_weights
 
 _FORMAT, _MAKER = "dpc-shape-2", "dpc generate4d train-prior"
 SHIPPED = Path(__file__).parent / "weights"
@@ -21,9 +20,8 @@ DEFAULT = "creatures"  # the shipped network
 
 def save_shape_model(path: Path, model: ShapeNetwork, notes: dict[str, Any]) -> None:
     """Writes the weights as float16; notes: a small JSON object, `size` and `confidence` among it."""
-    header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
     state = {name: value.half() if value.is_floating_point() else value for name, value in model.state_dict().items()}
-    save_weights(path, state, header)
+    save_weights(path, state, network_header(_FORMAT, model.config, notes))
 
 
 def find_shape_model(name: str | Path) -> Path:
@@ -40,9 +38,8 @@ def load_shape_model(name: str | Path) -> tuple[ShapeNetwork, dict[str, Any]]:
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
-    tensors, header = load_weights(path, _FORMAT, _MAKER)
-    config, notes = header_settings(path, header, ShapeConfig), header_value(path, header, "notes", dict)
-    size, confidence, count = notes.get("size"), notes.get("confidence"), config.widths[-1] + 1
+    network, notes = load_network(path, _FORMAT, _MAKER, ShapeConfig, ShapeNetwork)
+    size, confidence, count = notes.get("size"), notes.get("confidence"), network.config.widths[-1] + 1
     numbers = confidence if isinstance(confidence, list) else []
     if (
         type(size) is not int
@@ -54,8 +51,7 @@ def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
             f"{path}: its notes say size {size!r:.40} and confidence {confidence!r:.40}, expected pixels and {count} numbers;"
             " copy it again"
         )
-    tensors = {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}
-    return fill_network(lambda: ShapeNetwork(config), tensors, path), notes
+    return network, notes
 
 
 def _is_number(value: Any) -> bool:

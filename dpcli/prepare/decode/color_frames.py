@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, first_line
 from dpcli.path_names import first_names
 from dpcli.prepare.decode.pictures.tiff import BITS, COMPRESSION
 from dpcli.prepare.reader import natural_key
@@ -195,7 +195,7 @@ def _readable(path: Path):  # -> Iterator[PIL.Image.Image]
         with open_image(path) as image:
             yield image
     except (OSError, ValueError, SyntaxError) as error:
-        why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
+        why = "empty" if path.is_file() and path.stat().st_size == 0 else first_line(error)
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None
 
 

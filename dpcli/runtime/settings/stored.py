@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from math import isfinite
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -13,6 +14,19 @@ from dpcli.text_files import parse_json
 
 T = TypeVar("T")
 _LARGEST_INT = 2**31 - 1  # of a size
+
+
+class StoredConfig:
+    """Is the base of the dataclasses of sizes that weights files keep as JSON text."""
+
+    def to_json(self) -> str:
+        """Returns the text that a weights file keeps."""
+        return json.dumps(dataclasses.asdict(self))  # type: ignore[call-overload]
+
+    @classmethod
+    def from_json(cls: type[T], text: str) -> T:
+        """Returns the sizes that `to_json` wrote. Raises DataError as the function `from_json`."""
+        return from_json(cls, text)
 
 
 def from_json(cls: type[T], text: str) -> T:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import WIDEST, check, setting
-from dpcli.runtime.settings.stored import from_json
+from dpcli.runtime.settings.stored import StoredConfig
 
 
 @dataclass(frozen=True)
-class FlowConfig:
+class FlowConfig(StoredConfig):
     """Holds the widths and neighborhoods of a flow network; defaults are `compact`, ours, for training on a CPU.
 
     Lengths are in diameters of the object.
@@ -41,15 +39,6 @@ class FlowConfig:
 
     def __post_init__(self) -> None:
         check(self)
-
-    def to_json(self) -> str:
-        """Returns the text that a weights file keeps."""
-        return json.dumps(dataclasses.asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> FlowConfig:
-        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
-        return from_json(cls, text)
 
 
 @dataclass(frozen=True)

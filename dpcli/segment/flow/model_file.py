@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from copy import deepcopy
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_network, network_header, save_weights
 from dpcli.segment.flow.config import FlowConfig
 from dpcli.segment.flow.flowstep3d import FlowStep3D
 
@@ -21,8 +20,7 @@ _MOST, _FEWEST = 2048, 16  # points the network sees at once; fewer than the lat
 
 def save_flow_model(path: Path, model: FlowStep3D, notes: dict) -> None:
     """Writes the weights as float32, with the configuration and notes (a small JSON object) in the header."""
-    header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
-    save_weights(path, model.state_dict(), header)
+    save_weights(path, model.state_dict(), network_header(_FORMAT, model.config, notes))
 
 
 def find_flow_model(name: str | Path) -> Path:
@@ -42,9 +40,7 @@ def load_flow_model(name: str | Path) -> tuple[FlowStep3D, dict]:
 @functools.lru_cache(maxsize=2)
 def _read_flow_model(path: Path, _changed: int) -> tuple[FlowStep3D, dict]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
-    tensors, header = load_weights(path, _FORMAT, _MAKER)
-    config, notes = header_settings(path, header, FlowConfig), header_value(path, header, "notes", dict)
-    return fill_network(lambda: FlowStep3D(config), tensors, path), notes
+    return load_network(path, _FORMAT, _MAKER, FlowConfig, FlowStep3D)
 
 
 @functools.lru_cache(maxsize=2)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.fields import check, setting
-from dpcli.runtime.settings.stored import from_json
+from dpcli.runtime.settings.stored import StoredConfig
 from dpcli.runtime.settings.value_types import numbers_in
 
 Group = Literal["icosahedral", "trivial"]
@@ -71,7 +70,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class PartConfig:
+class PartConfig(StoredConfig):
     """Holds the sizes and switches of a part network as its weights file records them; defaults are `compact`."""
 
     layers: tuple[tuple[Layer, ...], ...]  # blocks of layers; every block ends in an invariant pooling
@@ -113,15 +112,6 @@ class PartConfig:
                 raise UsageError(f"{name} = {getattr(self, name)}: expected more than 0")
         if min(self.canonical_heads, self.motion_width) < 0:
             raise UsageError("canonical_heads, motion_width: expected at least 0")
-
-    def to_json(self) -> str:
-        """Returns the text that a weights file keeps."""
-        return json.dumps(dataclasses.asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> PartConfig:
-        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
-        return from_json(cls, text)
 
 
 def compact() -> PartConfig:

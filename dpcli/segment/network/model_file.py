@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from dpcli.errors import UsageError
-from dpcli.runtime.weights import (
-    fill_network,
-    find_weights,
-    header_settings,
-    header_value,
-    load_weights,
-    save_weights,
-    shipped_models,
-)
+from dpcli.runtime.weights import find_weights, load_network, network_header, save_weights, shipped_models
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.part_network import PartNetwork
 
@@ -24,8 +15,7 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
     """Writes the weights as float32, with the configuration and notes (a small JSON object) in the header."""
-    header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
-    save_weights(path, model.state_dict(), header)
+    save_weights(path, model.state_dict(), network_header(_FORMAT, model.config, notes))
 
 
 def find_model(name: str | Path, option: str = "--model") -> Path:
@@ -41,10 +31,7 @@ def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
 
     Raises DataError for a damaged file.
     """
-    path = find_model(name)
-    tensors, header = load_weights(path, _FORMAT, _MAKER)
-    config, notes = header_settings(path, header, PartConfig), header_value(path, header, "notes", dict)
-    return fill_network(lambda: PartNetwork(config), tensors, path), notes
+    return load_network(find_model(name), _FORMAT, _MAKER, PartConfig, PartNetwork)
 
 
 def default_model() -> str:
