@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Item, Sample, require_folder, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, require_folder, sample_of_frames
 
 CLASS_NAMES = (
     "high arm wave",
@@ -124,7 +124,7 @@ def check_shape(path: Path, frames: int, height: int, width: int) -> None:
 
 
 @dataclass(frozen=True)
-class MSRAction3D:
+class MSRAction3D(Reader):
     """Reads MSR-Action3D; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
 
     raw: Path
@@ -140,16 +140,9 @@ class MSRAction3D:
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k != "raw"}
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
         folder = require_folder(self.raw, expected)
         found: dict[str, Item] = {}
@@ -181,21 +174,18 @@ class MSRAction3D:
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
-        if self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST:
-            notes |= {_RESIZED: 1}
+        notes[_RESIZED] = int(self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST)
         points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
         points *= np.float32(1 / self.scale)
         return sample_of_frames(item, points, counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         expected, names = published_names(), {item.name for item in items if not item.problem}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}

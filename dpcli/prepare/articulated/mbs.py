@@ -16,7 +16,7 @@ from dpcli.npy_files import open_archive
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
 from dpcli.prepare.articulated.object_splits import counts_of_splits
-from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
+from dpcli.prepare.reader import SPLITS, Item, Reader, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
 from dpcli.store.sequence import TOLERANCE, are_rigid
 from dpcli.text_files import read_json
@@ -115,17 +115,14 @@ def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class MultiBodySync:
+class MultiBodySync(Reader):
     """Reads a folder of meta.json and data/%06d.npz."""
 
     raw: Path
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "as published"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
-    config: ClassVar[dict[str, Any]] = {}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         meta, parts = read_meta(self.raw), most_parts(self.raw)
         items = []
         for key in sorted(filter(split_called, meta), key=lambda key: SPLITS.index(split_called(key))):
@@ -142,14 +139,12 @@ class MultiBodySync:
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         points, part, poses = read_views(item.path)
         sequence = CloudSequence.from_frames(item.name, list(points), part=list(part), pose=poses, **describe(item))
         sequence.pad_parts(item.extra["parts"])
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{counted(len(items), 'sample')} ({counts_of_splits(item.split for item in items)})"]
         left = sorted({path.stem for path in (self.raw / "data").glob("[!.]*.npz")} - {item.name for item in items})
         return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])

@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names, path_inside
-from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 from dpcli.store.sequence import TOLERANCE, are_rigid
 
@@ -137,17 +137,14 @@ def most_parts(raw: Path) -> int:
 
 
 @dataclass(frozen=True)
-class OgcRooms:
+class OgcRooms(Reader):
     """Reads the released arrays, of OGC-DR and OGC-DRSV alike."""
 
     raw: Path
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "room width"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
-    config: ClassVar[dict[str, Any]] = {}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         rooms, parts = read_lists(self.raw), most_parts(self.raw)
         items = []
         for name, split in rooms:
@@ -159,7 +156,6 @@ class OgcRooms:
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         clouds, parts, poses = read_room(item.path)
         used, padded = 1 + max(int(part.max()) for part in parts), item.extra["parts"]
         if used > padded:
@@ -169,7 +165,6 @@ class OgcRooms:
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
         lines = [
             f"{counted(len(items), 'room')} ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"

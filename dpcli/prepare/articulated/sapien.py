@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_object import nothing_moves
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
@@ -19,7 +19,7 @@ from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.decode.folder_listing import walk_folders
-from dpcli.prepare.reader import Item, Sample, describe, natural_key
+from dpcli.prepare.reader import Item, Reader, Sample, describe, natural_key, require_least
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
@@ -98,7 +98,7 @@ def _studied(path: Path, root: Path | None, options: Articulation) -> Study:
 
 
 @dataclass(frozen=True)
-class Sapien:
+class Sapien(Reader):
     """Reads URDF objects. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how.
 
     ``allow_outside``: meshes may lie outside the raw folder, or a raw file's folder; links and ``..`` may lead there.
@@ -114,8 +114,7 @@ class Sapien:
     fields: ClassVar[tuple[str, ...]] = ("part", "pose", "joint")
 
     def __post_init__(self) -> None:
-        if self.pairs_per_object < 1:
-            raise UsageError(f"--pairs-per-object {self.pairs_per_object}: expected 1 or more")
+        require_least(self, pairs_per_object=1)
 
     @property
     def root(self) -> Path | None:
@@ -126,17 +125,14 @@ class Sapien:
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return sorted({found.category for found in find_objects(self.raw)} - {""})
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         own = {"pairs_per_object": self.pairs_per_object, "seed": self.seed, "split": asdict(self.split)}
         return {**own, **self.articulation.config}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found = find_objects(self.raw)
         splits = self.split.assign([f.category for f in found], self.seed)
         problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
@@ -156,14 +152,12 @@ class Sapien:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(item.path, self.root, self.articulation)
         if not item.extra["first"]:  # what is odd in an object counts once, not once a sequence
             studied = replace(studied, notes=Counter())
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         good = {item.path: item.split for item in items if not item.problem}
         shares = counts_of_splits(good.values())
         names = f" of {counted(len(self.class_names), 'category', 'categories')}" if self.class_names else ""

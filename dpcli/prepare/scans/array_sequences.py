@@ -92,7 +92,6 @@ class ArraySequences(OwnScans):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Returns the optional fields that every sample has."""
         time, color = self._first
         return self.fields_beside(time=time, color=color)
 
@@ -190,7 +189,6 @@ class ArraySequences(OwnScans):
         return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         time, color = self._first
         items = [
             Item(one.name, one.path, extra={**one.extra, "time": time, "color": color}, problem=one.problem)
@@ -199,7 +197,6 @@ class ArraySequences(OwnScans):
         return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         with open_arrays(item.path) as arrays:
             stored = self._stored(item, arrays)
             frames, colors = stored.frames(), stored.colors()
@@ -242,7 +239,6 @@ class ArraySequences(OwnScans):
         return stored.column(name, "--track" if is_track else "--keep-fields", gaps=not is_track)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         files = len(self._paths)
         lines = [f"{counted(len(items), 'sequence')} in {counted(files, 'file')} of arrays"]
         good = next((item for item in items if not item.problem), None)

@@ -17,7 +17,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
 from dpcli.store.schema import METERS, kept_name, kept_names
@@ -71,7 +71,7 @@ class Lengths:
 
 
 @dataclass(frozen=True)
-class OwnScans:
+class OwnScans(Reader):
     """Holds what the readers of people's own scans share: their options and one check of these, the classes of their table of
     labels, the unit, and what the provenance tells.
 
@@ -116,17 +116,14 @@ class OwnScans:
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return self._table.class_names
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return self.unit
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         left_out = ("raw", "labels", *(() if self.track else ("track",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 

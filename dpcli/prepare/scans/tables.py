@@ -67,7 +67,6 @@ class TableSequences(OwnScans):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Returns the optional fields that every sample has."""
         color, time = self._found
         return self.fields_beside(time=time, color=color)
 
@@ -120,7 +119,6 @@ class TableSequences(OwnScans):
         return items
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         return self._table.apply(self._items)
 
     def _load(self, path: Path) -> Loaded:
@@ -128,7 +126,6 @@ class TableSequences(OwnScans):
         return _load(self, path, facts.st_size, facts.st_mtime_ns)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         loaded = self._load(item.path)
         part = loaded.parts[item.extra["part"]]
         if item.extra["color"] and loaded.cloud.color is None:
@@ -157,7 +154,6 @@ class TableSequences(OwnScans):
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         tables = len(self._paths)
         lines = [f"{counted(len(items), 'sequence')} in {counted(tables, 'table')}"]
         good = next((item for item in items if not item.problem), None)
