@@ -17,6 +17,7 @@ from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
+    Table,
     find_frame_column,
     find_further_points,
     find_recording_columns,
@@ -141,16 +142,16 @@ class TableSequences(OwnScans):
             dropped = {what: count for what, count in dropped.items() if what != EMPTY}
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
         silent = 0 if time is not None or part.joined else part.silent
-        sample.notes |= {SILENT: silent} if silent else {}
+        sample.note({**dropped, **{note: 1 for note in part.notes}, JOINED: part.joined, SILENT: silent})
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
-        sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
+        if mixed:
+            sample.note({MIXED.format(mixed): 1})
         further = [] if self.track == COLUMNS else find_further_points(without(loaded.unused, self.keep))
         if further:
-            sample.notes |= {WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1}
+            sample.note({WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1})
         elif len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds):
-            sample.notes |= {SINGLE: 1}
+            sample.note({SINGLE: 1})
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
@@ -249,7 +250,7 @@ def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loade
     return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
-def open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+def open_table(path: Path) -> Table:
     """Returns the table in a file of any format. Raises DataError where it holds none."""
     suffix = path.suffix.lower()
     return (

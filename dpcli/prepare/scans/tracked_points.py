@@ -13,9 +13,9 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.column_names import Table
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.assembling import OwnScans
-from dpcli.prepare.scans.times_of_tables import Table
 from dpcli.store import CloudSequence
 from dpcli.store.views import ViewsReader
 
