@@ -17,6 +17,7 @@ from dpcli.regular_files import why_unreadable
 from dpcli.store import CloudSequence
 
 SPLITS = ("train", "validation", "test")
+ON_ERROR = ("skip", "stop")  # what becomes of a bad sample, or frame
 _SPLIT_WORDS = {
     **dict(zip(SPLITS, SPLITS)),
     "training": "train",
@@ -124,14 +125,18 @@ def require_least(options: object, **least: int) -> None:
     """Raises UsageError that names the first of some options, by the names of their fields, whose number is below the least."""
     for name, number in least.items():
         if getattr(options, name) < number:
-            raise UsageError(f"--{name.replace('_', '-')} {getattr(options, name)}: expected {number} or more")
+            raise UsageError(f"{_typed(options, name)}: expected {number} or more")
 
 
 def require_known(options: object, **known: Collection[object]) -> None:
     """Raises UsageError that names the first of some options whose value is none of the known ones."""
     for name, values in known.items():
         if getattr(options, name) not in values:
-            raise UsageError(f"--{name} {getattr(options, name)}: expected {' or '.join(map(str, values))}")
+            raise UsageError(f"{_typed(options, name)}: expected {' or '.join(map(str, values))}")
+
+
+def _typed(options: object, name: str) -> str:
+    return f"--{name.replace('_', '-')} {getattr(options, name)}"
 
 
 def describe(item: Item) -> dict[str, Any]:
@@ -174,8 +179,7 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
         raise DataError(f"{name}: holds no frames; expected at least 1")
     if len(kept) == 0:
         raise DataError(f"{name}: none of its frames ({len(counts)}) has a valid depth pixel or point")
-    dropped = len(counts) - len(kept)
-    return kept, {"frames without points dropped": dropped} if dropped else {}
+    return kept, {"frames without points dropped": len(counts) - len(kept)}
 
 
 def sample_of_frames(

@@ -195,8 +195,7 @@ class DepthVideos(Reader):
         require_byte_order(str(item.path), depth)
         notes |= doubts_of_name(name) | video.notes | ({} if told else doubts_of_units(depth))
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
-        if video.missing or video.ends_early:
-            notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
+        notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing)}
         depth, unit = self._inverted(depth, item.path), 1 / scale
         seen = depth
         if self.background != "none":

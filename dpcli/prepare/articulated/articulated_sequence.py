@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,11 +64,6 @@ class Articulation:
             raise UsageError(
                 f"--joint-step {self.joint_step}: expected a fraction of a joint's range, above 0, up to 1"
             )
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return asdict(self)
 
 
 @dataclass

@@ -130,7 +130,7 @@ class Sapien(Reader):
     @property
     def config(self) -> dict[str, Any]:
         own = {"pairs_per_object": self.pairs_per_object, "seed": self.seed, "split": asdict(self.split)}
-        return {**own, **self.articulation.config}
+        return {**own, **asdict(self.articulation)}
 
     def items(self) -> list[Item]:
         found = find_objects(self.raw)

@@ -63,8 +63,8 @@ class SyntheticArticulated(Reader):
     @property
     def config(self) -> dict[str, Any]:
         own = asdict(self)
-        own.pop("articulation")
-        return {**own, **self.articulation.config}
+        articulation = own.pop("articulation")
+        return own | articulation
 
     def items(self) -> list[Item]:
         names = tuple(self.class_names)

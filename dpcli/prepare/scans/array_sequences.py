@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -190,11 +190,8 @@ class ArraySequences(OwnScans):
 
     def items(self) -> list[Item]:
         time, color = self._first
-        items = [
-            Item(one.name, one.path, extra={**one.extra, "time": time, "color": color}, problem=one.problem)
-            for one in self._items
-        ]
-        return self._table.apply(items)
+        told = {"time": time, "color": color}
+        return self._table.apply([replace(one, extra={**one.extra, **told}) for one in self._items])
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         with open_arrays(item.path) as arrays:
@@ -229,9 +226,7 @@ class ArraySequences(OwnScans):
             cloud.keep(own)
         time = None if time is None else time[kept]
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= {MORE_FRAMES: more} if more else {}
-        sample.notes |= note_of_units(["points"], {"points": units})
-        sample.notes |= {UNCOUNTED: dropped} if dropped else {}
+        sample.note({MORE_FRAMES: more, **note_of_units(["points"], {"points": units}), UNCOUNTED: dropped})
         return sample
 
     def _column(self, stored: StoredSequence, name: str) -> np.ndarray:

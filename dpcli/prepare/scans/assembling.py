@@ -143,15 +143,13 @@ def assemble(
     divisor, converted = lengths.divisor(filled)
     # the fullest has no padding
     crowded = any(is_crowded(cloud.points) for cloud in filled[:: -(-len(filled) // _JUDGED)])
-    notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
-    if not color and (colored := sum(cloud.color is not None for cloud in filled)):
-        notes[UNREAD_COLORS] = colored
+    notes |= {**dropped, **converted, CROWDED: int(crowded)}
+    notes[UNREAD_COLORS] = 0 if color else sum(cloud.color is not None for cloud in filled)
     frames = [cloud.points for cloud in filled]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor
     points, shift = _joined(frames, divisor, ends)
-    if shift is not None:
-        notes[SHIFTED] = 1
+    notes[SHIFTED] = int(shift is not None)
     notes |= _rounded(frames, each, divisor, _COARSE if lengths.unit == "m" else np.inf)
     if lengths.unit == "m":
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
@@ -171,7 +169,7 @@ def assemble(
         extra=extra,
         **describe(item),
     )
-    notes |= {SCATTERED: 1} if _scatters(filled) else {}
+    notes[SCATTERED] = int(_scatters(filled))
     return Sample(sequence, notes)
 
 

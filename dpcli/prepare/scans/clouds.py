@@ -134,7 +134,7 @@ class CloudFolders(OwnScans):
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= notes
+        sample.note(notes)
         return sample
 
     def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:

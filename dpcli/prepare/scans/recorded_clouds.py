@@ -85,7 +85,7 @@ class RecordedClouds(OwnScans):
         if time is None:
             raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= read.notes
+        sample.note(read.notes)
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
