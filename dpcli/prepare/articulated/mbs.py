@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,7 +24,6 @@ from dpcli.text_files import read_json
 _MOST_PARTS = 1000  # of a sample
 
 
-@lru_cache(maxsize=4)
 def read_meta(raw: Path) -> dict[str, list[int]]:
     """Reads the numbers of the samples of each split from meta.json. Raises DataError when it is not that."""
     path = require_folder(raw, "meta.json and data/000000.npz ... as the authors distribute it") / "meta.json"
@@ -39,18 +38,15 @@ def read_meta(raw: Path) -> dict[str, list[int]]:
     return meta
 
 
-@lru_cache(maxsize=4)
-def most_parts(raw: Path) -> int:
-    """Returns the largest part id of all samples, which every pose is padded to."""
+def most_parts(paths: Iterable[Path]) -> int:
+    """Returns the largest part id of some samples, which every pose is padded to."""
     most = 1
-    for numbers in read_meta(raw).values():
-        for number in numbers:
-            try:
-                path = raw / "data" / f"{number:06d}.npz"
-                with open_archive(path) as archive:
-                    most = max(most, int(_part_ids(archive, path).max()))
-            except (DataError, OSError, zipfile.BadZipFile):
-                continue  # read() will say what is wrong with it
+    for path in paths:
+        try:
+            with open_archive(path) as archive:
+                most = max(most, int(_part_ids(archive, path).max()))
+        except (DataError, OSError, zipfile.BadZipFile):
+            continue  # read() will say what is wrong with it
     return most
 
 
@@ -123,7 +119,8 @@ class MultiBodySync(Reader):
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     def items(self) -> list[Item]:
-        meta, parts = read_meta(self.raw), most_parts(self.raw)
+        meta = read_meta(self.raw)
+        parts = most_parts(self.raw / "data" / f"{number:06d}.npz" for own in meta.values() for number in own)
         items = []
         for key in sorted(filter(split_called, meta), key=lambda key: SPLITS.index(split_called(key))):
             for number in meta[key]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -84,8 +84,7 @@ def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndar
     return clouds, parts, np.concatenate([np.stack(poses), still], axis=1)
 
 
-@lru_cache(maxsize=4)
-def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
+def read_lists(raw: Path) -> list[tuple[str, str]]:
     """Reads (room, split) from data/{train,val,test}.lst, in their order.
 
     Raises DataError when none is there or a room repeats.
@@ -104,7 +103,7 @@ def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
     name, times = Counter(name for name, _ in rooms).most_common(1)[0]
     if times > 1:
         raise DataError(f"{data}: room {name} is listed {times} times; a room is in one split, once")
-    return tuple(rooms)
+    return rooms
 
 
 def _misplaced(data: Path, name: str) -> str:
@@ -118,16 +117,12 @@ def _misplaced(data: Path, name: str) -> str:
     return ""
 
 
-@lru_cache(maxsize=4)
-def most_parts(raw: Path) -> int:
+def most_parts(rooms: Iterable[Path]) -> int:
     """Returns how many parts every pose is padded to: the most objects of a room, one more if its first frame has
     background.
     """
     most = 1
-    for name, _ in read_lists(raw):
-        folder = raw / "data" / name
-        if _misplaced(raw / "data", name):
-            continue
+    for folder in rooms:
         try:
             objects = map_npy(folder / "pose_00.npy").shape[0]
             most = max(most, int(read_segmentation(folder / "segm_00.npy", objects).max()) + 1, objects)
@@ -145,15 +140,14 @@ class OgcRooms(Reader):
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     def items(self) -> list[Item]:
-        rooms, parts = read_lists(self.raw), most_parts(self.raw)
-        items = []
-        for name, split in rooms:
-            folder = self.raw / "data" / name
-            problem = _misplaced(self.raw / "data", name)
-            if not problem and not folder.is_dir():
-                problem = f"{folder}: in the list of the {split} split, but no such folder"
-            items.append(Item(name, folder, split=split, extra={"parts": parts}, problem=problem))
-        return items
+        data, items = self.raw / "data", []
+        for name, split in read_lists(self.raw):
+            problem = _misplaced(data, name)
+            if not problem and not (data / name).is_dir():
+                problem = f"{data / name}: in the list of the {split} split, but no such folder"
+            items.append(Item(name, data / name, split=split, problem=problem))
+        parts = most_parts(item.path for item in items if not item.problem)
+        return [replace(item, extra={"parts": parts}) for item in items]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         clouds, parts, poses = read_room(item.path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,8 +36,7 @@ class FoundObject:
     name: str
 
 
-@lru_cache(maxsize=4)
-def find_objects(raw: Path) -> tuple[FoundObject, ...]:
+def find_objects(raw: Path) -> list[FoundObject]:
     """Returns every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
 
     The category is ``model_cat`` of the object's meta.json, as the original distribution has it; without that, the
@@ -54,7 +53,7 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     found = [_describe(raw, path) for path in files]
     counts = Counter(f.name for f in found)
     found = [f if counts[f.name] == 1 else replace(f, name=_long_name(raw, f)) for f in found]
-    return tuple(sorted(found, key=lambda f: (f.category, natural_key(f.name))))
+    return sorted(found, key=lambda f: (f.category, natural_key(f.name)))
 
 
 def _urdf_files(raw: Path) -> list[Path]:
@@ -123,9 +122,13 @@ class Sapien(Reader):
             return None
         return self.raw.parent if self.raw.is_file() else self.raw
 
+    @cached_property
+    def _found(self) -> list[FoundObject]:
+        return find_objects(self.raw)
+
     @property
     def class_names(self) -> list[str]:
-        return sorted({found.category for found in find_objects(self.raw)} - {""})
+        return sorted({found.category for found in self._found} - {""})
 
     @property
     def config(self) -> dict[str, Any]:
@@ -133,9 +136,8 @@ class Sapien(Reader):
         return {**own, **asdict(self.articulation)}
 
     def items(self) -> list[Item]:
-        found = find_objects(self.raw)
-        splits = self.split.assign([f.category for f in found], self.seed)
-        problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
+        splits = self.split.assign([f.category for f in self._found], self.seed)
+        problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in self._found))
         pad = min(self.articulation.max_parts, 1 + max(joints))
         labels = {name: label for label, name in enumerate(self.class_names)}
         return [
@@ -147,7 +149,7 @@ class Sapien(Reader):
                 extra={"parts": pad, "first": number == 0, "files": own},
                 problem=problem,
             )
-            for f, split, problem, own in zip(found, splits, problems, meshes)
+            for f, split, problem, own in zip(self._found, splits, problems, meshes)
             for number in range(1 if problem else self.pairs_per_object)
         ]
 

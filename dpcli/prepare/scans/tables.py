@@ -68,7 +68,7 @@ class TableSequences(OwnScans):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        color, time = self._found
+        time, color = self._first
         return self.fields_beside(time=time, color=color)
 
     @cached_property
@@ -90,16 +90,16 @@ class TableSequences(OwnScans):
         return named_below(self.raw, found, "table")
 
     @cached_property
-    def _found(self) -> tuple[bool, bool]:
-        """Returns whether the first good table has colors and whether its frames have times."""
+    def _first(self) -> tuple[bool, bool]:
+        """Returns whether the frames of the first good table have times, and whether it has colors."""
         for path in self._paths.values():
             try:
                 loaded = self._load(path)
             except DataError:
                 continue  # a bad sample: the next one tells
             timed = all(loaded.times(part, self.fps) is not None for part in loaded.parts)
-            return loaded.cloud.color is not None, timed
-        return False, bool(self.fps)
+            return timed, loaded.cloud.color is not None
+        return bool(self.fps), False
 
     def _in_folders(self) -> tuple[list[str], str]:
         return [item.name for item in self._items], "CLASS/TABLE"
@@ -107,6 +107,7 @@ class TableSequences(OwnScans):
     @cached_property
     def _items(self) -> list[Item]:
         items = []
+        time, color = self._first
         for name, path in self._paths.items():
             try:
                 parts = self._load(path).parts
@@ -115,7 +116,7 @@ class TableSequences(OwnScans):
                 continue
             for place, part in enumerate(parts):
                 own = f"{name}/{as_utf8(part.name)}" if part.name else name
-                extra = {"part": place, "color": self._found[0], "time": self._found[1]}
+                extra = {"part": place, "time": time, "color": color}
                 items.append(Item(own, path, extra=extra))
         return items
 
@@ -161,7 +162,7 @@ class TableSequences(OwnScans):
         if good:
             loaded = self._load(good.path)
             first = loaded.parts[0]
-            used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
+            used = self._first[0] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
             clock = used.columns if used else ()
             unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, self.track, *clock))
             lines[0] += f", frames by column {loaded.column!r}" if loaded.column else ", a frame in each row"
