@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.containers import own_data_set
 from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -104,15 +105,13 @@ def read_mat(path: Path) -> np.ndarray:
 def _read_mat73(path: Path) -> np.ndarray:
     import h5py
 
-    from dpcli.store.file import refuse_claim
     from dpcli.store.heap_check import check_heaps
 
     check_heaps(path)
     with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:
-        if not isinstance(file.get("depth"), h5py.Dataset):
+        if "depth" not in list(file):
             raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
-        refuse_claim(file["depth"], path)
-        return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
+        return own_data_set(file, "depth", path)[()].T  # HDF5 lists MATLAB's axes in reverse
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.containers import own_data_set
 from dpcli.prepare.reader import Item, Reader, Sample, describe, natural_key, published_found, require_folder
 from dpcli.store import CloudSequence
-from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = tuple(
@@ -29,16 +29,9 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 
 
 def _read_array(path: Path, name: str) -> np.ndarray:
-    """Reads a data set of an HDF5 file. Raises DataError when absent, damaged, or kept in another file."""
     check_heaps(path)
     with reading(path), h5py.File(path, "r") as file:
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-            found = ", ".join(sorted(file)) or "none"
-            raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
-        if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
-            raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
-        refuse_claim(file[name], path)
-        return file[name][()]
+        return own_data_set(file, name, path)[()]
 
 
 @lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
