@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
@@ -54,12 +53,7 @@ class LabelMap:
         classes = content.get("classes", [])
         if not all(isinstance(one, str) and one for one in classes) or len(set(classes)) < len(classes):
             raise DataError(f"{path}: classes {classes!r:.80}; expected names, each once")
-        return cls(tuple(map(str, content.get("classes", ()))), content.get("labels", {}), content.get("files", {}))
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the map for the provenance."""
-        return {"classes": list(self.classes), "labels": self.labels, "files": self.files}
+        return cls(tuple(classes), content.get("labels", {}), content.get("files", {}))
 
     def resolve(self, sources: Sequence[tuple[Path, list[str]]]) -> tuple[list[str], list[list[int | None]]]:
         """Returns the new classes, and for each (file, its classes) the new number of each of its classes, None = left

@@ -18,14 +18,12 @@ from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources, says_ti
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc, open_arrays, read_tables
 from dpcli.prepare.array_files.netcdf_packing import with_gaps
 from dpcli.prepare.cloud_formats.column_names import (
-    axes_in,
+    TypedTable,
     find_axes,
     find_colors,
     find_frame_column,
     find_trios,
     first_unit,
-    note_of_units,
-    unit_of_attributes,
 )
 from dpcli.prepare.scans.times_of_tables import seconds_of
 
@@ -33,13 +31,10 @@ Columns = dict[str, np.ndarray]
 Found = tuple[Columns, dict[str, str], tuple[str, ...]]  # columns, units of some, names of what lies beside them
 
 
-class ArrayTable:
-    """Offers the table in a file of arrays as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
+class ArrayTable(TypedTable):
+    """Reads the table in a file of arrays. by_name: the columns as stored. others: the names of arrays beside it that are no columns.
 
-    by_name: the columns as stored. units: what attributes say of those of some, and of the whole table by "". cut: notes of what
-    is odd about its numbers. others: the names of arrays beside it that are no columns.
-
-    Raises DataError where the file holds no table, or several, or x, y and z in different units.
+    Raises DataError where the file holds no table, or several.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,14 +44,10 @@ class ArrayTable:
             raise DataError(
                 f"{path}: holds {told}; expected one: write it as .csv or .parquet (pandas: DataFrame.to_csv)"
             )
-        self.path = path
-        ((self.by_name, self.units, self.others),) = found.values()
-        self.names = tuple(self.by_name)
-        self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
-        self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
+        ((self.by_name, units, self.others),) = found.values()
+        super().__init__(path, tuple(self.by_name), units)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
-        """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
         chosen = [self.by_name[self.names[place]] for place in places]
         for place, column in zip(places, chosen):
             if column.dtype.kind not in "uifb":
@@ -65,14 +56,10 @@ class ArrayTable:
         return np.stack([column.astype(np.float64) for column in chosen], axis=1) if chosen else np.zeros((rows, 0))
 
     def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as text."""
         cells = self.by_name[self.names[place]].tolist()
         return [one.decode("utf-8", "replace") if isinstance(one, bytes) else str(one) for one in cells]
 
     def moments(self, place: int) -> np.ndarray | None:
-        """Returns the seconds f64 (N) since the first of a column of dates or durations, or of one whose attribute ``units`` is a
-        unit of time; NaN where it is empty; None of others.
-        """
         name = self.names[place]
         column = self.by_name[name]
         if column.dtype.kind in "mM" and len(column):

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError, reading
+from dpcli.errors import DataError, reading
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
-from dpcli.prepare.reader import Item, Reader, Sample
+from dpcli.prepare.reader import ON_ERROR, Item, Reader, Sample, require_known
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.device import cpu_count
 from dpcli.runtime.machines.shards import Shard, describe_shard
@@ -59,8 +59,7 @@ class Conversion:
     item_seconds: float = 0
 
     def __post_init__(self) -> None:
-        if self.on_error not in ("skip", "stop"):
-            raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
+        require_known(self, on_error=ON_ERROR)
         Thinning(self.points, self.sampling)
 
     @property

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.regular_files import why_unreadable
 from dpcli.store import CloudSequence
 
 SPLITS = ("train", "validation", "test")
+ON_ERROR = ("skip", "stop")  # what becomes of a bad sample, or frame
 _SPLIT_WORDS = {
     **dict(zip(SPLITS, SPLITS)),
     "training": "train",
@@ -47,10 +49,19 @@ class Item:
 
 @dataclass
 class Sample:
-    """Holds one sequence, and counts of what its reader left out, such as ``{"frames without depth dropped": 2}``."""
+    """Holds one sequence, and counts of what its reader left out, such as ``{"frames without depth dropped": 2}``; what counts
+    0 isn't kept.
+    """
 
     sequence: CloudSequence
     notes: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.notes = {what: count for what, count in self.notes.items() if count}
+
+    def note(self, counts: Mapping[str, int]) -> None:
+        """Adds further counts."""
+        self.notes |= {what: count for what, count in counts.items() if count}
 
 
 def published_found(items: Sequence[Item], published: Mapping[str, int], kind: str) -> list[str]:
@@ -69,44 +80,63 @@ def split_called(word: str) -> str:
 
 
 class Reader(Protocol):
-    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker
+    """Reads a raw format. Implementations derive from it and are frozen dataclasses of their options, so they pickle into worker
     processes, without what `items` found: what `read` needs of that is in the item's ``extra``. What they list may be called
     ``inputs``; workers have none.
 
-    What an option decides is a property, what is always the same a ClassVar.
+    What an option decides is a property, what is always the same a ClassVar. What is said here of a method isn't said again where
+    one implements it.
     """
 
     @property
     def class_names(self) -> Sequence[str]:
-        """Returns the class names in the order of their labels."""
-        ...
+        """Returns the class names in the order of their labels, none where no sample has one."""
+        return ()
 
     @property
+    @abstractmethod
     def length_unit(self) -> str:
         """Returns the name of the output's unit of length."""
-        ...
 
     @property
+    @abstractmethod
     def fields(self) -> tuple[str, ...]:
         """Returns the optional fields that every sample has, such as ``time``."""
-        ...
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        ...
+        """Returns the options that decide the content, for the provenance: all that don't say where the raw data are."""
+        return {name: value for name, value in asdict(self).items() if name not in ("raw", "inputs")}  # type: ignore[call-overload]
 
+    @abstractmethod
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the folder is not what it should be."""
-        ...
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
 
+    @abstractmethod
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns one sample, in a worker process. Raises DataError on a bad one. ``rng`` belongs to this item alone."""
-        ...
 
+    @abstractmethod
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        ...
+
+
+def require_least(options: object, **least: int) -> None:
+    """Raises UsageError that names the first of some options, by the names of their fields, whose number is below the least."""
+    for name, number in least.items():
+        if getattr(options, name) < number:
+            raise UsageError(f"{_typed(options, name)}: expected {number} or more")
+
+
+def require_known(options: object, **known: Collection[object]) -> None:
+    """Raises UsageError that names the first of some options whose value is none of the known ones."""
+    for name, values in known.items():
+        if getattr(options, name) not in values:
+            raise UsageError(f"{_typed(options, name)}: expected {' or '.join(map(str, values))}")
+
+
+def _typed(options: object, name: str) -> str:
+    return f"--{name.replace('_', '-')} {getattr(options, name)}"
 
 
 def describe(item: Item) -> dict[str, Any]:
@@ -149,8 +179,7 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
         raise DataError(f"{name}: holds no frames; expected at least 1")
     if len(kept) == 0:
         raise DataError(f"{name}: none of its frames ({len(counts)}) has a valid depth pixel or point")
-    dropped = len(counts) - len(kept)
-    return kept, {"frames without points dropped": dropped} if dropped else {}
+    return kept, {"frames without points dropped": len(counts) - len(kept)}
 
 
 def sample_of_frames(

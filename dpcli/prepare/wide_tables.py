@@ -15,6 +15,8 @@ from dpcli.prepare.array_files.containers import SUFFIXES
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
+    Table,
+    TypedTable,
     note_of_units,
     one_unit,
     unit_of,
@@ -46,7 +48,7 @@ class WideTable:
     coordinates, "" where nothing tells it; missing: how many rows fewer there are than the lines above the names count.
     """
 
-    table: TextTable | ParquetTable | ArrayTable
+    table: Table
     trios: np.ndarray
     unit: str
     missing: int = 0
@@ -59,7 +61,7 @@ class WideTable:
         names = tuple(self.table.names[place] for place in self.trios.ravel())
         identities = np.tile(np.arange(len(self.trios)), len(values))
         dropped = {MISSING: self.missing} if self.missing else {}
-        dropped |= {} if isinstance(self.table, TextTable) else note_of_units(names, self.table.units)
+        dropped |= note_of_units(names, self.table.units) if isinstance(self.table, TypedTable) else {}
         points = values.reshape(-1, 3)
         return Cloud(points, unit=self.unit, columns=names, dropped=dropped, track=identities)
 
@@ -121,14 +123,14 @@ def hint(path: Path, error: DataError) -> DataError:
     return error if ROWS_ARE_FRAMES in str(error) else DataError(f"{error}; {ROWS_ARE_FRAMES}")
 
 
-def _checked(path: Path, table: TextTable | ParquetTable | ArrayTable, told: list[list[str]], unit: str) -> WideTable:
+def _checked(path: Path, table: Table, told: list[list[str]], unit: str) -> WideTable:
     trios = _trios(told)
     if len(trios) < 2:
         raise DataError(f"{path}: --track columns: {len(trios)} points in the columns; expected two or more")
     if isinstance(table, TextTable) and not table.first_rows(1):
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
     own = one_unit({unit_of(table.names[place]) for trio in trios for place in trio})
-    if not isinstance(table, TextTable):
+    if isinstance(table, TypedTable):
         unit = unit_of_attributes(path, [table.names[place] for trio in trios for place in trio], table.units)
     return WideTable(table, np.array(trios), own or unit)
 

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.scans.tables import TableSequences
 from dpcli.store import CloudsReader
@@ -318,3 +319,14 @@ def test_a_unit_of_a_whole_table_counts_and_an_empty_one_is_said_to_be(tmp_path)
     np.save(tmp_path / "b.npy", structured()[:0])
     run = told("prepare", "clouds", tmp_path / "b.npy", "-o", tmp_path / "out.h5", "--jobs", 1, "--item-seconds", 0)
     assert run.returncode == 3 and "a table without rows" in run.stderr
+
+
+@pytest.mark.parametrize("form, name", [("table", "table"), ("fixed", "block1_values"), ("fixed", "axis1")])
+def test_nothing_is_read_from_the_files_that_a_table_of_pandas_names(tmp_path, form, name):
+    for file in ("a.h5", "other.h5"):
+        write_pandas(tmp_path / file, form)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["df"][name]
+        file["df"][name] = h5py.ExternalLink("other.h5", f"/df/{name}")
+    with pytest.raises(DataError, match=f"a.h5: no data set '{name}' of its own; found "):
+        ArrayTable(tmp_path / "a.h5")

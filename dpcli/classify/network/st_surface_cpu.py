@@ -230,7 +230,6 @@ class _SurfaceFit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, activation, weight, bias, near, times, logits, neighbors, layout, fit):
-        """Computes the result, and keeps what the gradient needs."""
         tensors = tuple(
             None if one is None else one.detach() for one in (activation, weight, bias, near, times, logits)
         )
@@ -260,7 +259,6 @@ class _SurfaceFit(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_planes, grad_away):
-        """Returns the gradients of the inputs."""
         *tensors, planes, features, weights, moments = ctx.saved_tensors
         case, layout, made = _Case(tuple(tensors), *ctx.rest), ctx.rest[1], (features, weights, moments)
         to_planes, to_away = _flat(grad_planes), _NOTHING if grad_away is None else _flat(grad_away)

@@ -43,14 +43,12 @@ class _Sum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values: Tensor) -> Tensor:
-        """Computes the result, and keeps what the gradient needs."""
         total = values.clone()
         dist.all_reduce(total)
         return total
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> Tensor:
-        """Returns the gradients of the inputs."""
         total = gradient.clone()
         dist.all_reduce(total)
         return total

@@ -39,7 +39,7 @@ from dpcli.prepare.decode.depth_files import (
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.prepare.times_beside import with_times
@@ -82,7 +82,7 @@ def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthVideos:
+class DepthVideos(Reader):
     """Reads anybody's depth videos.
 
     Lengths in meters, focal lengths and centers in pixels, the field of view in degrees.
@@ -126,12 +126,10 @@ class DepthVideos:
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return self._table.class_names
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         apart = ("inputs", "labels", "label_from_folder", "far", "calibration", "pattern", "topic")
         values = {k: v for k, v in asdict(self).items() if k not in apart}
         given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern, "topic": self.topic}
@@ -182,13 +180,11 @@ class DepthVideos:
         return list(items.values())
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         told = {"timed": self._timed}
         items = [replace(item, extra={**item.extra, **told}) for item in self._found]
         return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         series: Series | None = item.extra["series"]
         name = f"{item.name} {series.pattern if series else ''}"
         require_depth(item.path, name)
@@ -199,8 +195,7 @@ class DepthVideos:
         require_byte_order(str(item.path), depth)
         notes |= doubts_of_name(name) | video.notes | ({} if told else doubts_of_units(depth))
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
-        if video.missing or video.ends_early:
-            notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
+        notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing)}
         depth, unit = self._inverted(depth, item.path), 1 / scale
         seen = depth
         if self.background != "none":
@@ -286,7 +281,6 @@ class DepthVideos:
         return self.intrinsics or Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{counted(len(items), 'depth video')} found"]
         if unread := [
             one for given in self.inputs for one in _not_read(given, {path for path, _, _ in self._chosen[0]})

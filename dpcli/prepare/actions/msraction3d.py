@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import first_names
+from dpcli.prepare.array_files.containers import own_data_set
 from dpcli.prepare.array_files.mat5 import read_mat5
 from dpcli.prepare.decode.folder_listing import files_below
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Item, Sample, require_folder, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, require_folder, sample_of_frames
 
 CLASS_NAMES = (
     "high arm wave",
@@ -104,15 +105,13 @@ def read_mat(path: Path) -> np.ndarray:
 def _read_mat73(path: Path) -> np.ndarray:
     import h5py
 
-    from dpcli.store.file import refuse_claim
     from dpcli.store.heap_check import check_heaps
 
     check_heaps(path)
     with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:
-        if not isinstance(file.get("depth"), h5py.Dataset):
+        if "depth" not in list(file):
             raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
-        refuse_claim(file["depth"], path)
-        return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
+        return own_data_set(file, "depth", path)[()].T  # HDF5 lists MATLAB's axes in reverse
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:
@@ -124,7 +123,7 @@ def check_shape(path: Path, frames: int, height: int, width: int) -> None:
 
 
 @dataclass(frozen=True)
-class MSRAction3D:
+class MSRAction3D(Reader):
     """Reads MSR-Action3D; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
 
     raw: Path
@@ -140,16 +139,9 @@ class MSRAction3D:
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k != "raw"}
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
         folder = require_folder(self.raw, expected)
         found: dict[str, Item] = {}
@@ -181,21 +173,18 @@ class MSRAction3D:
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
-        if self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST:
-            notes |= {_RESIZED: 1}
+        notes[_RESIZED] = int(self.focal == _FOCAL and (height, width) != _SIZE and height >= _SMALLEST)
         points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
         points *= np.float32(1 / self.scale)
         return sample_of_frames(item, points, counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         expected, names = published_names(), {item.name for item in items if not item.problem}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}

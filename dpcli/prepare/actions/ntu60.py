@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from dpcli.prepare.decode.calibration import read_calibration
 from dpcli.prepare.decode.folder_listing import folder_files, is_folder, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
-from dpcli.prepare.reader import Item, Sample, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, require_known, sample_of_frames
 from dpcli.prepare.series import is_hidden
 
 CLASS_NAMES = (
@@ -147,7 +147,7 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
 
 
 @dataclass(frozen=True)
-class NTU60:
+class NTU60(Reader):
     """Reads NTU RGB+D 60; defaults are the published point-cloud preprocessing. ``scale``: mm per unit of length."""
 
     inputs: tuple[Path, ...]
@@ -158,23 +158,15 @@ class NTU60:
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
-        if self.protocol not in PUBLISHED:
-            raise UsageError(f"--protocol {self.protocol}: expected {' or '.join(PUBLISHED)}")
+        require_known(self, protocol=PUBLISHED)
         if not self.scale > 0:
             raise UsageError(f"--scale {self.scale:g}: expected millimeters per unit of length, more than 0")
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return {1.0: "mm", 1000.0: "m"}.get(self.scale, f"{self.scale:g} mm")
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k != "inputs"}
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found: dict[str, Item] = {}
         for given in self.inputs:
             for item in self._search(given):
@@ -251,7 +243,6 @@ class NTU60:
                 yield Item(f"{path}/{name}", path, problem=_strange_name(path / name, first))
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         where = item.path if "root" in item.extra else item.path / item.name
         frames, others = self._frames(item, where)
         numbers = np.array([number for number, _ in frames])
@@ -265,11 +256,10 @@ class NTU60:
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         points = np.concatenate(clouds)
         points *= np.float32(1 / self.scale)
-        notes = {}
-        if missing := int(numbers[-1] - np.count_nonzero(numbers)):
-            notes["frames missing in the numbering from 1"] = missing
-        if others:
-            notes["pictures left out, whose name is not MDepth-NUMBER.png"] = len(others)
+        notes = {
+            "frames missing in the numbering from 1": int(numbers[-1] - np.count_nonzero(numbers)),
+            "pictures left out, whose name is not MDepth-NUMBER.png": len(others),
+        }
         return sample_of_frames(item, points, counts, notes, time=(numbers - numbers[0]) / FPS, where=where)
 
     def _frames(self, item: Item, where: Path) -> tuple[list[tuple[int, Path | bytes]], list[str]]:
@@ -290,7 +280,6 @@ class NTU60:
         return sorted(frames), others
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         good = [item for item in items if not item.problem]
         setups, splits = Counter(item.name[:4] for item in good), Counter(item.split for item in good)
         lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} unusable"]

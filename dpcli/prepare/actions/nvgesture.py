@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, published_found, require_folder, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, published_found, require_folder, require_known, sample_of_frames
 from dpcli.text_files import read_text
 
 CLASSES = 25
@@ -95,7 +95,7 @@ def pixel_places(height: int, width: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class NvGesture:
+class NvGesture(Reader):
     """Reads NvGesture; defaults are the peers' preprocessing without their thinning to 32 frames x 512 points."""
 
     raw: Path
@@ -106,22 +106,13 @@ class NvGesture:
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
-        for option, allowed in (("foreground", ("otsu", "none")), ("coordinates", ("image", "camera"))):
-            if getattr(self, option) not in allowed:
-                raise UsageError(f"--{option} {getattr(self, option)}: expected {' or '.join(allowed)}")
+        require_known(self, foreground=("otsu", "none"), coordinates=("image", "camera"))
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return IMAGE_UNIT if self.coordinates == "image" else "255 - gray level"
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k != "raw"}
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "nvgesture_train_correct_cvpr2016_v2.lst, nvgesture_test_... and Video_data/"
         folder = require_folder(self.raw, expected)
         lists = {split: self._lists(split) for split in PUBLISHED}
@@ -171,20 +162,18 @@ class NvGesture:
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         start, stop = item.extra["start"], item.extra["stop"]
         frames, rate = read_video(item.path, start, stop)
         if not frames:
             raise DataError(f"{item.path}: ends before frame {start}; the list asks for frames {start} to {stop - 1}")
         clouds = [self._points(frame) for frame in frames]
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
-        notes = {}
-        if self.coordinates == "image" and frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST:
-            notes[_RESIZED] = 1
-        if rate and abs(rate - _FPS) > 1:
-            notes[_OTHER_RATE] = 1
-        if len(frames) < stop - start:
-            notes["frames listed beyond the end of a video"] = stop - start - len(frames)
+        resized = self.coordinates == "image" and frames[0].shape != _SIZE and len(frames[0]) >= _SMALLEST
+        notes = {
+            _RESIZED: int(resized),
+            _OTHER_RATE: int(rate is not None and abs(rate - _FPS) > 1),
+            "frames listed beyond the end of a video": stop - start - len(frames),
+        }
         return sample_of_frames(
             item, np.concatenate(clouds), counts, notes, time=np.arange(len(clouds)) / (rate or _FPS)
         )
@@ -205,7 +194,6 @@ class NvGesture:
         return points
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         lines = published_found(items, PUBLISHED, "clips")
         for *others, last in filter(None, map(self._lists, PUBLISHED)):
             lines += (

@@ -18,7 +18,7 @@ from dpcli.prepare.actions.pts_label import PtsLabel
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
 from dpcli.prepare.median import median
-from dpcli.prepare.reader import Item, Reader, Sample, require_folder, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, require_folder, require_known, sample_of_frames
 
 KEYS = {"msraction3d": "point_clouds", "ntu60": "data"}  # what MeteorNet's and PSTNet's scripts call the array
 _NO_SHARE = 0.5  # units of the output of this many and more stored units are 33 m where these are shares of 65535 mm
@@ -72,7 +72,7 @@ def _detect(raw: Path) -> str:
 
 
 @dataclass(frozen=True)
-class PeerClouds:
+class PeerClouds(Reader):
     """Reads one `.npz` per video. The clouds come out as `prepare msraction3d` or `prepare ntu60` would make them.
 
     ``scale``: stored units per unit of length in the output. By default 300 for MSR-Action3D, whose files hold raw
@@ -86,19 +86,16 @@ class PeerClouds:
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        if self.protocol not in ntu60.PUBLISHED:
-            raise UsageError(f"--protocol {self.protocol}: expected {' or '.join(ntu60.PUBLISHED)}")
+        require_known(self, protocol=ntu60.PUBLISHED)
         if self.scale is not None and not self.scale > 0:
             raise UsageError(f"--scale {self.scale:g}: expected stored units per unit of length, more than 0")
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return list(msraction3d.CLASS_NAMES if self.form == "msraction3d" else ntu60.CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         if self.form == "msraction3d":
             return f"{self._scale:g} raw depth units" if self._scale != 1 else "raw depth unit"
         if self._scale >= _NO_SHARE:
@@ -111,12 +108,10 @@ class PeerClouds:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         protocol = {"protocol": self.protocol} if self.form == "ntu60" else {}
         return {"form": self.form, "scale": self._scale, **protocol}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         root = require_folder(self.raw, f"one .npz per video of {self.form}")
         make: Callable[[Path], Item] = self._msr_item if self.form == "msraction3d" else self._ntu_item
         items: dict[str, Item] = {}
@@ -149,7 +144,6 @@ class PeerClouds:
         return ntu60.video_item(match[1], path, self.protocol)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         names = member_names(item.path)
         key = next((k for k in (KEYS[self.form], *KEYS.values()) if k in names), None)
         if key is None:
@@ -175,7 +169,6 @@ class PeerClouds:
         return {f"videos whose points aren't where the scripts of {self.form} put them ({expected}); {fits}": 1}
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         published = 567 if self.form == "msraction3d" else ntu60.VIDEOS
         counts = f"{sum(found.values())} of the {published} published videos found"

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.actions import nvgesture
 from dpcli.prepare.actions.shrec17_lists import (
@@ -26,7 +26,7 @@ from dpcli.prepare.actions.shrec17_lists import (
     gesture_names,
 )
 from dpcli.prepare.decode.folder_listing import files_below, leads_out
-from dpcli.prepare.reader import Item, Sample, natural_key, require_folder, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, natural_key, require_folder, require_known, sample_of_frames
 
 FILE = "pts_label.npy"
 _SHREC = re.compile(r"(?:.*/)?(gesture_(\d+)/finger_(\d+)/subject_(\d+)/essai_\d+)")
@@ -48,7 +48,7 @@ def read_array(path: Path) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PtsLabel:
+class PtsLabel(Reader):
     """Reads pts_label.npy files in folders gesture_G/finger_F/subject_S/essai_E, or class_C/subjectS_rR.
 
     ``lists``: the folder of SHREC'17's train_gestures.txt and test_gestures.txt; by default they are looked for in
@@ -61,12 +61,10 @@ class PtsLabel:
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        if self.labels not in (14, 28):
-            raise UsageError(f"--labels {self.labels}: expected 14 or 28")
+        require_known(self, labels=(14, 28))
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         if self._is_nvgesture():
             return list(nvgesture.CLASS_NAMES)
         found = self._list_files()
@@ -76,12 +74,10 @@ class PtsLabel:
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return nvgesture.IMAGE_UNIT if self._is_nvgesture() else IMAGE_UNIT
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         return {"labels": self.labels}
 
     def _list_files(self) -> list[ListFile]:
@@ -98,7 +94,6 @@ class PtsLabel:
         return any(map(_NVGESTURE.fullmatch, folders)) and not any(map(_SHREC.fullmatch, folders))
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         root = require_folder(self.raw, f"{FILE} files in folders such as gesture_1/finger_1/subject_1/essai_1")
         lists = self._list_files()
         alone = self._is_nvgesture()
@@ -155,17 +150,14 @@ class PtsLabel:
         return Item(match[1], path, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         array = read_array(item.path)
         # a frame in which nothing was found was filled with points of depth 0
         seen = array[..., 2] > 0
         counts = seen.sum(1).astype(np.int64)
-        partly = int((~seen)[counts > 0].sum())
-        notes = {"points of depth 0 dropped": partly} if partly else {}
+        notes = {"points of depth 0 dropped": int((~seen)[counts > 0].sum())}
         return sample_of_frames(item, array[seen].astype(np.float32), counts, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         lines = [f"{counted(sum(found.values()), 'gesture')} found (train {found['train']}, test {found['test']})"]
         if found[""]:

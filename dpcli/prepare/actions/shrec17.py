@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.prepare.actions.shrec17_lists import IMAGE_UNIT, PUBLISHED, find_lists, gesture_names, listed_items
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
-from dpcli.prepare.reader import Item, Sample, natural_key, published_found, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, natural_key, published_found, require_known, sample_of_frames
 
 INTRINSICS = Intrinsics(463.889, 463.889, 320.0, 240.0)
 WIDTH, HEIGHT, FPS = 640, 480, 30.0
@@ -72,7 +72,7 @@ def keep_only_hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.nda
 
 
 @dataclass(frozen=True)
-class Shrec17:
+class Shrec17(Reader):
     """Reads SHREC'17; defaults are the peers' preprocessing without their thinning to 32 frames x 256 points."""
 
     raw: Path
@@ -85,33 +85,18 @@ class Shrec17:
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
-        for option, allowed in (
-            ("labels", (14, 28)),
-            ("foreground", ("component", "none")),
-            ("median", (0, 3, 5)),
-            ("coordinates", ("image", "camera")),
-        ):
-            if getattr(self, option) not in allowed:
-                words = " or ".join(str(v) for v in allowed)
-                raise UsageError(f"--{option} {getattr(self, option)}: expected {words}")
+        require_known(self, labels=(14, 28), foreground=("component", "none"), median=(0, 3, 5))
+        require_known(self, coordinates=("image", "camera"))
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return gesture_names(find_lists(self.raw), self.labels)
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return IMAGE_UNIT if self.coordinates == "image" else "mm"
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k != "raw"}
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         lists = find_lists(self.raw)
         root = lists[0].path.parent
         items = {
@@ -125,7 +110,6 @@ class Shrec17:
         return sorted(items.values(), key=lambda item: natural_key(item.name))
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         frames, notes = self._frame_paths(item)
         ticks, regions = self._regions(item, len(frames))
         clouds, cut = [], 0
@@ -135,10 +119,8 @@ class Shrec17:
             cut += bool(self.bbox and [x, y, right - x, bottom - y] != regions[k].tolist())
             clouds.append(self._points(depth, x, y, right, bottom))
         more = len(ticks) - len(frames) - sum(notes.values())  # which frame a region belongs to is their order alone
-        if more > 0:
-            notes["regions beyond the frames of a sequence left out; do they belong together?"] = more
-        if cut:
-            notes["hand regions cut at the edge of the image"] = cut
+        notes["regions beyond the frames of a sequence left out; do they belong together?"] = max(more, 0)
+        notes["hand regions cut at the edge of the image"] = cut
         seconds = _frame_seconds(ticks, len(frames))
         if seconds is None:
             seconds = np.arange(len(frames)) / FPS
@@ -158,8 +140,7 @@ class Shrec17:
                 f"{item.path}: {count - there} of the {count} frames that the list promises are missing, "
                 f"the first: {len(wanted)}_depth.png"
             )
-        more = len(found) - count
-        return [found[name] for name in wanted], {"frames beyond the count in the list left out": more} if more else {}
+        return [found[name] for name in wanted], {"frames beyond the count in the list left out": len(found) - count}
 
     def _regions(self, item: Item, frames: int) -> tuple[np.ndarray, np.ndarray]:
         path = item.path / "general_informations.txt"
@@ -189,7 +170,6 @@ class Shrec17:
         return np.stack([row + y, column + x, region[row, column]], axis=1).astype(np.float32)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         return published_found(items, PUBLISHED, "gestures")
 
 

@@ -164,22 +164,37 @@ def _table_of(item: Any, path: Path) -> tuple[dict[str, np.ndarray], dict[str, A
     import h5py
 
     if isinstance(item, h5py.Dataset) or "table" in item:
-        rows = item if isinstance(item, h5py.Dataset) else item["table"]
+        rows = item if isinstance(item, h5py.Dataset) else _own(item, "table", path)
         values = _checked(rows, path)[()].reshape(-1)
         return {name: values[name] for name in values.dtype.names}, dict(rows.attrs)
     found, about = {}, {}
     for place in range(len(item)):
         if f"block{place}_items" in item:
-            names = [str(one, "utf-8", "replace") for one in _checked(item[f"block{place}_items"], path)[()].tolist()]
-            values = _checked(item[f"block{place}_values"], path)[()]
+            called = own_data_set(item, f"block{place}_items", path)[()].tolist()
+            names = [str(one, "utf-8", "replace") for one in called]
+            values = own_data_set(item, f"block{place}_values", path)[()]
             if values.ndim == 2 and values.shape[1] == len(names):  # texts are a pickle
                 found |= dict(zip(names, values.T))
                 about |= {f"{name}_dtype": item[f"block{place}_values"].attrs.get("value_type", "") for name in names}
-    index = item.get("axis1")
+    index = _own(item, "axis1", path) if "axis1" in item else None
     if index is not None and index.dtype.kind in "uif" and found:
         name = str(np.asarray(index.attrs.get("name", b"N.")).astype(str))
         found = {"index" if name == "N." else name: _checked(index, path)[()], **found}  # a pickle of None
     return found, about
+
+
+def own_data_set(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    """Returns a data set by name. Raises DataError where it is absent or a link, and as `_checked` does."""
+    return _checked(_own(group, name, path), path)
+
+
+def _own(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    import h5py
+
+    is_link = not isinstance(group.get(name, getlink=True), h5py.HardLink)  # perhaps to another file
+    if is_link or not isinstance(group[name], h5py.Dataset):
+        raise DataError(f"{path}: no data set {name!r} of its own; found {', '.join(sorted(group)) or 'none'}")
+    return group[name]
 
 
 def _checked(item: h5py.Dataset, path: Path) -> h5py.Dataset:
@@ -383,9 +398,7 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> np.ndarray | list
     inside = [file[reference] for reference in item[()].reshape(-1)]
     if not all(isinstance(one, h5py.Dataset) and one.dtype.kind in "uif" and not _is_no_array(one) for one in inside):
         return None
-    for one in inside:
-        _require_bytes(one, path)
-    return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else one[()].T for one in inside])
+    return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else _checked(one, path)[()].T for one in inside])
 
 
 def _read_all(path: Path) -> Mapping[str, Array | list[np.ndarray]]:

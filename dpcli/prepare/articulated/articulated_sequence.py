@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from dpcli.prepare.articulated.articulated_object import (
 )
 from dpcli.prepare.articulated.true_joints import true_joints
 from dpcli.prepare.meshes.surface_points import Camera, choose_on_surface, choose_visible, points_on
-from dpcli.prepare.reader import Sample
+from dpcli.prepare.reader import Sample, require_known, require_least
 from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.store import CloudSequence
 
@@ -56,22 +56,14 @@ class Articulation:
     sampling: str = "random"
 
     def __post_init__(self) -> None:
-        for name, least in (("points_per_frame", 1), ("frames", 1), ("max_parts", 2), ("min_part", 0)):
-            if getattr(self, name) < least:
-                option = name.removesuffix("_per_frame").replace("_", "-")
-                raise UsageError(f"--{option} {getattr(self, name)}: expected {least} or more")
-        for name, known in (("view", VIEWS), ("orientation", ORIENTATIONS)):
-            if getattr(self, name) not in known:
-                raise UsageError(f"--{name} {getattr(self, name)}: expected {' or '.join(known)}")
+        if self.points_per_frame < 1:
+            raise UsageError(f"--points {self.points_per_frame}: expected 1 or more")
+        require_least(self, frames=1, max_parts=2, min_part=0)
+        require_known(self, view=VIEWS, orientation=ORIENTATIONS)
         if not 0 < self.joint_step <= 1:
             raise UsageError(
                 f"--joint-step {self.joint_step}: expected a fraction of a joint's range, above 0, up to 1"
             )
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return asdict(self)
 
 
 @dataclass
@@ -196,4 +188,4 @@ def _notes(studied: Study, clouds: tuple, ids: tuple, num_parts: int, options: A
     few = sum(len(cloud) < options.points_per_frame for cloud in clouds)
     unseen = sum(len(np.unique(part)) < num_parts for part in ids)
     found = {"frames with fewer points than asked for": few, "frames in which not every part is seen": unseen}
-    return {**studied.notes, **{what: count for what, count in found.items() if count}}
+    return {**studied.notes, **found}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ from dpcli.npy_files import open_archive
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.safe_pickle import read_npz_member
 from dpcli.prepare.articulated.object_splits import counts_of_splits
-from dpcli.prepare.reader import SPLITS, Item, Sample, describe, require_folder, split_called
+from dpcli.prepare.reader import SPLITS, Item, Reader, Sample, describe, require_folder, split_called
 from dpcli.store import CloudSequence
 from dpcli.store.sequence import TOLERANCE, are_rigid
 from dpcli.text_files import read_json
@@ -24,7 +24,6 @@ from dpcli.text_files import read_json
 _MOST_PARTS = 1000  # of a sample
 
 
-@lru_cache(maxsize=4)
 def read_meta(raw: Path) -> dict[str, list[int]]:
     """Reads the numbers of the samples of each split from meta.json. Raises DataError when it is not that."""
     path = require_folder(raw, "meta.json and data/000000.npz ... as the authors distribute it") / "meta.json"
@@ -39,18 +38,15 @@ def read_meta(raw: Path) -> dict[str, list[int]]:
     return meta
 
 
-@lru_cache(maxsize=4)
-def most_parts(raw: Path) -> int:
-    """Returns the largest part id of all samples, which every pose is padded to."""
+def most_parts(paths: Iterable[Path]) -> int:
+    """Returns the largest part id of some samples, which every pose is padded to."""
     most = 1
-    for numbers in read_meta(raw).values():
-        for number in numbers:
-            try:
-                path = raw / "data" / f"{number:06d}.npz"
-                with open_archive(path) as archive:
-                    most = max(most, int(_part_ids(archive, path).max()))
-            except (DataError, OSError, zipfile.BadZipFile):
-                continue  # read() will say what is wrong with it
+    for path in paths:
+        try:
+            with open_archive(path) as archive:
+                most = max(most, int(_part_ids(archive, path).max()))
+        except (DataError, OSError, zipfile.BadZipFile):
+            continue  # read() will say what is wrong with it
     return most
 
 
@@ -115,18 +111,16 @@ def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class MultiBodySync:
+class MultiBodySync(Reader):
     """Reads a folder of meta.json and data/%06d.npz."""
 
     raw: Path
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "as published"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
-    config: ClassVar[dict[str, Any]] = {}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        meta, parts = read_meta(self.raw), most_parts(self.raw)
+        meta = read_meta(self.raw)
+        parts = most_parts(self.raw / "data" / f"{number:06d}.npz" for own in meta.values() for number in own)
         items = []
         for key in sorted(filter(split_called, meta), key=lambda key: SPLITS.index(split_called(key))):
             for number in meta[key]:
@@ -142,14 +136,12 @@ class MultiBodySync:
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         points, part, poses = read_views(item.path)
         sequence = CloudSequence.from_frames(item.name, list(points), part=list(part), pose=poses, **describe(item))
         sequence.pad_parts(item.extra["parts"])
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{counted(len(items), 'sample')} ({counts_of_splits(item.split for item in items)})"]
         left = sorted({path.stem for path in (self.raw / "data").glob("[!.]*.npz")} - {item.name for item in items})
         return lines + ([f"not read, in no split of meta.json: {first_names(left)}"] if left else [])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy
 from dpcli.path_names import first_names, path_inside
-from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 from dpcli.store.sequence import TOLERANCE, are_rigid
 
@@ -84,8 +84,7 @@ def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndar
     return clouds, parts, np.concatenate([np.stack(poses), still], axis=1)
 
 
-@lru_cache(maxsize=4)
-def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
+def read_lists(raw: Path) -> list[tuple[str, str]]:
     """Reads (room, split) from data/{train,val,test}.lst, in their order.
 
     Raises DataError when none is there or a room repeats.
@@ -104,7 +103,7 @@ def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
     name, times = Counter(name for name, _ in rooms).most_common(1)[0]
     if times > 1:
         raise DataError(f"{data}: room {name} is listed {times} times; a room is in one split, once")
-    return tuple(rooms)
+    return rooms
 
 
 def _misplaced(data: Path, name: str) -> str:
@@ -118,16 +117,12 @@ def _misplaced(data: Path, name: str) -> str:
     return ""
 
 
-@lru_cache(maxsize=4)
-def most_parts(raw: Path) -> int:
+def most_parts(rooms: Iterable[Path]) -> int:
     """Returns how many parts every pose is padded to: the most objects of a room, one more if its first frame has
     background.
     """
     most = 1
-    for name, _ in read_lists(raw):
-        folder = raw / "data" / name
-        if _misplaced(raw / "data", name):
-            continue
+    for folder in rooms:
         try:
             objects = map_npy(folder / "pose_00.npy").shape[0]
             most = max(most, int(read_segmentation(folder / "segm_00.npy", objects).max()) + 1, objects)
@@ -137,29 +132,24 @@ def most_parts(raw: Path) -> int:
 
 
 @dataclass(frozen=True)
-class OgcRooms:
+class OgcRooms(Reader):
     """Reads the released arrays, of OGC-DR and OGC-DRSV alike."""
 
     raw: Path
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "room width"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
-    config: ClassVar[dict[str, Any]] = {}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        rooms, parts = read_lists(self.raw), most_parts(self.raw)
-        items = []
-        for name, split in rooms:
-            folder = self.raw / "data" / name
-            problem = _misplaced(self.raw / "data", name)
-            if not problem and not folder.is_dir():
-                problem = f"{folder}: in the list of the {split} split, but no such folder"
-            items.append(Item(name, folder, split=split, extra={"parts": parts}, problem=problem))
-        return items
+        data, items = self.raw / "data", []
+        for name, split in read_lists(self.raw):
+            problem = _misplaced(data, name)
+            if not problem and not (data / name).is_dir():
+                problem = f"{data / name}: in the list of the {split} split, but no such folder"
+            items.append(Item(name, data / name, split=split, problem=problem))
+        parts = most_parts(item.path for item in items if not item.problem)
+        return [replace(item, extra={"parts": parts}) for item in items]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         clouds, parts, poses = read_room(item.path)
         used, padded = 1 + max(int(part.max()) for part in parts), item.extra["parts"]
         if used > padded:
@@ -169,7 +159,6 @@ class OgcRooms:
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
         lines = [
             f"{counted(len(items), 'room')} ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"

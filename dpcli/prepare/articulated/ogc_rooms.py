@@ -23,7 +23,7 @@ from dpcli.prepare.meshes.surface_points import (
     points_on,
     raycasting_scene,
 )
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_known, require_least
 from dpcli.store import CloudSequence
 
 POINTS = 2048
@@ -52,34 +52,28 @@ class RoomOptions:
         if not self.objects or not all(2 <= n <= 8 for n in self.objects) or len(set(self.objects)) < len(self.objects):
             given = ",".join(map(str, self.objects))
             raise UsageError(f"--objects {given}: expected different numbers of 2 to 8, such as 8,7,6,5,4")
-        for name in ("rooms", "frames", "points"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} {getattr(self, name)}: expected 1 or more")
-        if self.up not in ("y", "z"):
-            raise UsageError(f"--up {self.up}: expected y or z")
+        require_least(self, rooms=1, frames=1, points=1)
+        require_known(self, up=("y", "z"))
 
 
 @dataclass(frozen=True)
-class GeneratedRooms:
+class GeneratedRooms(Reader):
     """Makes rooms of objects drawn from a folder of meshes, by a seed. One room is in one split, 75, 5 and 20 %."""
 
     meshes: Path
     options: RoomOptions = RoomOptions()
     split: SplitRule = SplitRule(fractions=FRACTIONS)
     seed: int = 0
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "room width"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         names = "\n".join(find_meshes(self.meshes)).encode("utf-8", "surrogateescape")
         digest = hashlib.sha256(names).hexdigest()[:16]
         return {**asdict(self.options), "fractions": list(self.split.fractions), "meshes_digest": digest}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         find_meshes(self.meshes)
         counts = self.options.objects
         names = [(n, f"{n}_{k:06d}") for n in counts for k in range(self.options.rooms)]
@@ -91,7 +85,6 @@ class GeneratedRooms:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: Counter = Counter()
         shapes = self._draw_shapes(item.extra["objects"], notes, rng)
         layout = draw_layout([shape.hull for shape in shapes], self.options.frames, self.options.motion, rng)
@@ -104,7 +97,7 @@ class GeneratedRooms:
         notes["frames with fewer points than asked for"] = sum(len(c) < self.options.points for c in clouds)
         notes["frames in which not every object is seen"] = sum(len(np.unique(p)) < len(shapes) for p in parts)
         sequence = CloudSequence.from_frames(item.name, list(clouds), part=list(parts), pose=pose, **describe(item))
-        return Sample(sequence, {what: count for what, count in notes.items() if count})
+        return Sample(sequence, notes)
 
     def _draw_shapes(self, count: int, notes: Counter, rng: np.random.Generator) -> list[Shape]:
         """Draws meshes with equal chances; another is drawn in place of one that cannot be read, and that is counted."""
@@ -138,7 +131,6 @@ class GeneratedRooms:
         return points, part
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         shares = counts_of_splits(item.split for item in items)
         kinds = ",".join(map(str, self.options.objects))
         return [f"{len(items)} rooms of {kinds} objects ({shares}) from {len(find_meshes(self.meshes))} meshes"]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_object import nothing_moves
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
@@ -19,7 +19,7 @@ from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.urdf import load_object, mesh_files, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.decode.folder_listing import walk_folders
-from dpcli.prepare.reader import Item, Sample, describe, natural_key
+from dpcli.prepare.reader import Item, Reader, Sample, describe, natural_key, require_least
 from dpcli.runtime.progress import log
 from dpcli.text_files import read_json
 
@@ -36,8 +36,7 @@ class FoundObject:
     name: str
 
 
-@lru_cache(maxsize=4)
-def find_objects(raw: Path) -> tuple[FoundObject, ...]:
+def find_objects(raw: Path) -> list[FoundObject]:
     """Returns every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
 
     The category is ``model_cat`` of the object's meta.json, as the original distribution has it; without that, the
@@ -54,7 +53,7 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     found = [_describe(raw, path) for path in files]
     counts = Counter(f.name for f in found)
     found = [f if counts[f.name] == 1 else replace(f, name=_long_name(raw, f)) for f in found]
-    return tuple(sorted(found, key=lambda f: (f.category, natural_key(f.name))))
+    return sorted(found, key=lambda f: (f.category, natural_key(f.name)))
 
 
 def _urdf_files(raw: Path) -> list[Path]:
@@ -98,7 +97,7 @@ def _studied(path: Path, root: Path | None, options: Articulation) -> Study:
 
 
 @dataclass(frozen=True)
-class Sapien:
+class Sapien(Reader):
     """Reads URDF objects. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how.
 
     ``allow_outside``: meshes may lie outside the raw folder, or a raw file's folder; links and ``..`` may lead there.
@@ -114,8 +113,7 @@ class Sapien:
     fields: ClassVar[tuple[str, ...]] = ("part", "pose", "joint")
 
     def __post_init__(self) -> None:
-        if self.pairs_per_object < 1:
-            raise UsageError(f"--pairs-per-object {self.pairs_per_object}: expected 1 or more")
+        require_least(self, pairs_per_object=1)
 
     @property
     def root(self) -> Path | None:
@@ -124,22 +122,22 @@ class Sapien:
             return None
         return self.raw.parent if self.raw.is_file() else self.raw
 
+    @cached_property
+    def _found(self) -> list[FoundObject]:
+        return find_objects(self.raw)
+
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
-        return sorted({found.category for found in find_objects(self.raw)} - {""})
+        return sorted({found.category for found in self._found} - {""})
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         own = {"pairs_per_object": self.pairs_per_object, "seed": self.seed, "split": asdict(self.split)}
-        return {**own, **self.articulation.config}
+        return {**own, **asdict(self.articulation)}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        found = find_objects(self.raw)
-        splits = self.split.assign([f.category for f in found], self.seed)
-        problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
+        splits = self.split.assign([f.category for f in self._found], self.seed)
+        problems, joints, meshes = zip(*(_inspect(f.path, self.root, self.raw) for f in self._found))
         pad = min(self.articulation.max_parts, 1 + max(joints))
         labels = {name: label for label, name in enumerate(self.class_names)}
         return [
@@ -151,19 +149,17 @@ class Sapien:
                 extra={"parts": pad, "first": number == 0, "files": own},
                 problem=problem,
             )
-            for f, split, problem, own in zip(found, splits, problems, meshes)
+            for f, split, problem, own in zip(self._found, splits, problems, meshes)
             for number in range(1 if problem else self.pairs_per_object)
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(item.path, self.root, self.articulation)
         if not item.extra["first"]:  # what is odd in an object counts once, not once a sequence
             studied = replace(studied, notes=Counter())
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         good = {item.path: item.split for item in items if not item.problem}
         shares = counts_of_splits(good.values())
         names = f" of {counted(len(self.class_names), 'category', 'categories')}" if self.class_names else ""

@@ -16,7 +16,7 @@ from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, 
 from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.procedural.kinds import KINDS
 from dpcli.prepare.articulated.procedural.solids import Builder
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_least
 from dpcli.runtime.seeds import PrepareStream, generator
 
 
@@ -34,7 +34,7 @@ def _studied(seed: int, number: int, kinds: tuple[str, ...], options: Articulati
 
 
 @dataclass(frozen=True)
-class SyntheticArticulated:
+class SyntheticArticulated(Reader):
     """Makes procedural objects. ``kinds``: those to make; empty for all."""
 
     objects: int = 260
@@ -47,9 +47,7 @@ class SyntheticArticulated:
     fields: ClassVar[tuple[str, ...]] = ("part", "pose", "joint")
 
     def __post_init__(self) -> None:
-        for option in ("objects", "sequences_per_object"):
-            if getattr(self, option) < 1:
-                raise UsageError(f"--{option.replace('_', '-')} {getattr(self, option)}: expected 1 or more")
+        require_least(self, objects=1, sequences_per_object=1)
         if len(set(self.kinds)) < len(self.kinds):
             raise UsageError(
                 f"--kinds {','.join(self.kinds)}: a kind is named twice; each is made as often as the others"
@@ -60,18 +58,15 @@ class SyntheticArticulated:
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return sorted(self.kinds or KINDS)
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         own = asdict(self)
-        own.pop("articulation")
-        return {**own, **self.articulation.config}
+        articulation = own.pop("articulation")
+        return own | articulation
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         names = tuple(self.class_names)
         kinds = [names[number % len(names)] for number in range(self.objects)]
         splits = self.split.assign(kinds, self.seed)
@@ -90,12 +85,10 @@ class SyntheticArticulated:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(self.seed, item.extra["object"], tuple(self.class_names), self.articulation)
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         shares = counts_of_splits({item.extra["object"]: item.split for item in items}.values())
         kinds = min(self.objects, len(self.class_names))  # they take turns
         return [

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from dpcli.errors import DataError
 
@@ -105,6 +108,46 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
         if all(len(places) == 1 for places in found):
             return [places[0] for places in found], one_unit({unit_of(names[places[0]]) for places in found})
     return None
+
+
+class Table(ABC):
+    """Offers the columns of a table in a file.
+
+    names: of the columns, none where the file names none. unit: of the coordinates, "" where nothing tells it. cut: notes of
+    what is odd about its numbers.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    unit: str
+    cut: dict[str, int]
+
+    @abstractmethod
+    def columns(self, places: Sequence[int]) -> np.ndarray:
+        """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError where they hold none."""
+
+    @abstractmethod
+    def words(self, place: int) -> list[str]:
+        """Returns the cells of a column as text, "" of an empty one."""
+
+    @abstractmethod
+    def moments(self, place: int) -> np.ndarray | None:
+        """Returns the seconds f64 (N) since the first of a column whose type is time, or of numbers in what the file calls a
+        unit of time, NaN where it is empty; None of others.
+        """
+
+
+class TypedTable(Table):
+    """Holds a table whose columns have types, and so all the digits of their numbers, and may have attributes.
+
+    units: what these say of the units of some columns, and of the whole table by "". Raises DataError for x, y and z in
+    different units.
+    """
+
+    def __init__(self, path: Path, names: Sequence[str], units: Mapping[str, str]) -> None:
+        self.path, self.names, self.units = path, tuple(names), units
+        self.unit = unit_of_attributes(path, axes_in(self.names), units)
+        self.cut = note_of_units(axes_in(self.names), units)
 
 
 def axes_in(names: Sequence[str]) -> list[str]:

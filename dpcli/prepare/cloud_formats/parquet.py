@@ -11,14 +11,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, reading
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.column_names import (
-    axes_in,
-    find_axes,
-    note_of_units,
-    seconds_in_brackets,
-    unit_of_attributes,
-    words_of,
-)
+from dpcli.prepare.cloud_formats.column_names import TypedTable, find_axes, seconds_in_brackets, words_of
 
 COLUMNAR = (".parquet", ".feather", ".arrow")
 _CELL = 8  # bytes of a number
@@ -44,18 +37,14 @@ def is_pose_table(path: Path) -> bool:
         return False
 
 
-class ParquetTable:
-    """Offers a Parquet or Feather file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words.
-
-    units: what the metadata of its schema say of those of some columns, and of the whole table by "".
-    """
+class ParquetTable(TypedTable):
+    """Reads a Parquet or Feather file, whose attributes are the metadata of its schema."""
 
     def __init__(self, path: Path) -> None:
         try:
             import pyarrow.parquet as parquet
         except ImportError:
             raise DpcError('Parquet and Feather need pyarrow: pip install "dpc-toolkit[parquet]"') from None
-        self.path = path
         with reading(path):  # whose sentence is that of memory that ends
             try:
                 if path.suffix.lower() != ".parquet":
@@ -70,15 +59,12 @@ class ParquetTable:
                 kind, said = path.suffix[1:].capitalize(), " ".join(str(error).split())
                 raise DataError(f"{path}: not a readable {kind} table, perhaps truncated ({said})") from None
         self._table = self._table.flatten()  # a column of structures becomes one for each of their fields
-        self.names = tuple(self._table.column_names)
         schema = self._table.schema
         told = {field.name: _told_units(field.metadata) for field in schema} | {"": _told_units(schema.metadata)}
-        self.units = {name: units for name, units in told.items() if units}
-        self.unit = unit_of_attributes(path, axes_in(self.names), self.units)
-        self.cut = note_of_units(axes_in(self.names), self.units)  # numbers that no text holds have all their digits
+        units = {name: units for name, units in told.items() if units}
+        super().__init__(path, self._table.column_names, units)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
-        """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
         from pyarrow.types import is_temporal
 
         found = []
@@ -96,15 +82,11 @@ class ParquetTable:
         return np.stack(found, axis=1) if found else np.zeros((self._table.num_rows, 0))
 
     def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as text, "" of an empty one."""
         return [
             "" if value is None or value != value else str(value) for value in self._table.column(place).to_pylist()
         ]
 
     def moments(self, place: int) -> np.ndarray | None:
-        """Returns the seconds f64 (N) since the first of a column of times or durations, or of numbers in what the metadata call a
-        unit of time, NaN where it is empty; None of others.
-        """
         import pyarrow.types as types
 
         column = self._table.column(place)

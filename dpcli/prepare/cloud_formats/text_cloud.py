@@ -24,7 +24,7 @@ from dpcli.prepare.cloud_formats.cloud import (
     unread_columns,
     without,
 )
-from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
+from dpcli.prepare.cloud_formats.column_names import Table, find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_numbers import COMMENTS, TextTable, read_text_table
 from dpcli.text_files import decode_text
 
@@ -195,7 +195,7 @@ def _counting_column(table: TextTable, unread: Sequence[str]) -> str:
     return ""
 
 
-def refuse_frames_of_table(table: TextTable) -> None:
+def refuse_frames_of_table(table: Table) -> None:
     """Raises DataError when a column numbers several frames; one of words, such as the names of pictures, doesn't."""
     if name := find_frame_column(table.names):
         try:

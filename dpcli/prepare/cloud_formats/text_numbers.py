@@ -16,6 +16,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
+    Table,
     find_trios,
     seconds_in_brackets,
     unit_of,
@@ -48,13 +49,13 @@ _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns
 
 
 @dataclass(frozen=True)
-class TextTable:
-    """Holds the rows of a text, not yet taken for numbers. names: of the columns, none where the file names none.
+class TextTable(Table):
+    """Holds the rows of a text, not yet taken for numbers.
 
     body: the text from the first row on; first_line: which line of the file that is, from 1. delimiter: None for blanks.
     limit: rows that count, None for all. header: the line of the names, which files that were joined hold several times.
-    unit: of the coordinates, as comments before the rows tell it. seconds: (column, seconds of its unit) where a row below
-    the header tells that a column is in a unit of time.
+    unit: as comments before the rows tell it. seconds: (column, seconds of its unit) where a row below the header tells that
+    a column is in a unit of time.
     """
 
     path: Path
@@ -112,7 +113,6 @@ class TextTable:
         return [cell.strip() for cell in line.split(self.delimiter)]
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
-        """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError that names the line."""
         signs = {",": "", ";": ",.", "\t": ",."}.get(self.delimiter or "", ",")  # that may divide thousands
         doubtful = bool(signs) and _may_be_thousands(self.body, signs)
         sure = self.width and not doubtful
@@ -123,13 +123,9 @@ class TextTable:
         return self._read_any(list(places)) if fast is None else fast
 
     def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as they are written."""
         return [self._row(line, number)[place] for number, line in self.numbered]
 
     def moments(self, place: int) -> np.ndarray | None:
-        """Returns the seconds f64 (N) since the first of a column of numbers in a unit of time, as a row below the header tells;
-        None of others: a text has no types.
-        """
         unit = dict(self.seconds).get(self.names[place]) if self.names else None
         if unit is None:
             return None

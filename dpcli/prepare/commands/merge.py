@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -89,7 +90,7 @@ def _merge_unlike(
                 chosen.append((source, index, table[label] if label >= 0 else -1))
     config = {
         "merge": [source.path.name for source in sources],
-        "labels": labels.config,
+        "labels": asdict(labels),
         "prefix": any(source.prefix for source in sources),
         "compression": compression,
         "sources": [source.provenance for source in sources],

@@ -18,9 +18,11 @@ from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.column_names import unit_of
 from dpcli.prepare.decode.calibration_texts import (
     MATLAB_ADVICE,
+    lower_keys,
     mapping_of_bouguet,
     mapping_of_ini,
     mapping_of_xml,
+    numbers_in,
     without_matlab_counting,
 )
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
@@ -176,10 +178,7 @@ def _yaml(path: Path, text: str) -> Any:
 
 def _number_or_text(text: str) -> Any:
     """Returns the number that a text holds, the list of its numbers where it holds four or more, else the text itself."""
-    try:
-        numbers = [float(word) for word in text.rstrip("; ").replace(",", " ").split()]
-    except ValueError:
-        return text
+    numbers = numbers_in(text.rstrip("; ").replace(",", " ")) or ()
     return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= len(_TERMS[:4]) else text
 
 
@@ -205,11 +204,7 @@ def _load_npy(path: Path) -> list[float]:
 def _only_numbers(text: str) -> list[float] | None:
     """Returns the numbers of a text that holds nothing else but brackets and separators, None of another one."""
     kept = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
-    words = re.sub(r"[\[\](),;]", " ", "\n".join(kept)).split()
-    try:
-        return [float(word) for word in words] or None
-    except ValueError:
-        return None
+    return numbers_in(re.sub(r"[\[\](),;]", " ", "\n".join(kept)))
 
 
 def _of_numbers(path: Path, numbers: list[float]) -> Calibration:
@@ -315,7 +310,7 @@ def _camera_of(path: Path, data: dict[str, Any]) -> dict[str, Any]:
 def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yields every mapping that holds intrinsics, with what is said around it, such as the size of the pictures."""
     if isinstance(data, dict) and depth < 5:
-        own = {str(key).lower(): value for key, value in data.items()}
+        own = lower_keys(data)
         around = {**outer, **{key: value for key, value in own.items() if not isinstance(value, dict)}}
         if _holds_camera(own):
             yield name, {**outer, **own}
@@ -370,7 +365,7 @@ def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[i
     if isinstance(size, dict) and "data" in size:  # OpenCV's lists
         size = size["data"]
     if isinstance(size, dict):
-        return _resolution(path, {str(key).lower(): value for key, value in size.items()}, center)
+        return _resolution(path, lower_keys(size), center)
     if isinstance(size, str):
         size = [float(number) for number in re.findall(r"\d+", size)]
     pair = size if isinstance(size, list) and len(size) == 2 else _sides(own)
@@ -413,9 +408,9 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
     values = _coefficients(own)
     told = own.get("distortion")  # as RealSense's tools print it, or what stands beside the coefficients
-    told = _first({str(k).lower(): v for k, v in told.items()}, _MODEL) if isinstance(told, dict) else told
+    told = _first(lower_keys(told), _MODEL) if isinstance(told, dict) else told
     if isinstance(values, dict):
-        listed = values.get("data", _coefficients({str(key).lower(): value for key, value in values.items()}))
+        listed = values.get("data", _coefficients(lower_keys(values)))
         values = _named_terms(path, values) if listed is None else listed
     if values is None and any(key in own for key in _TERMS):
         values = _named_terms(path, {key: own[key] for key in _TERMS if key in own})
@@ -468,8 +463,7 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
 
     Raises DataError where what is said is no scale, or two scales differ.
     """
-    top = {str(key).lower(): value for key, value in whole.items()}
-    said = [{k: v for k, v in part.items() if _is_scale(k) and v is not None} for part in (own, top)]
+    said = [{k: v for k, v in part.items() if _is_scale(k) and v is not None} for part in (own, lower_keys(whole))]
     found = said[0] or said[1]
     if not found and "scale" in own and "fx" in own:  # as mappers of rooms write it
         found = {"depth_scale": own["scale"]}

@@ -42,7 +42,7 @@ def _of_node(node: Any, depth: int = 0) -> Any:
     """Returns a matrix, a mapping of the entries below, a list of numbers, a number, or the text."""
     data = node.find("data")
     if data is not None:
-        numbers = _numbers(data.text or "")
+        numbers = numbers_in(data.text or "")
         return {"data": data.text or "" if numbers is None else numbers}
     if len(node) and depth < _DEEPEST:
         return {child.tag: _of_node(child, depth + 1) for child in node}
@@ -50,7 +50,7 @@ def _of_node(node: Any, depth: int = 0) -> Any:
 
 
 def _number_or_text(text: str) -> Any:
-    numbers = _numbers(text)
+    numbers = numbers_in(text)
     return text.strip().strip('"') if numbers is None else numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -59,14 +59,14 @@ def mapping_of_ini(text: str) -> dict[str, Any] | None:
     matrix = _OST_MATRIX.search(text)
     if matrix is None:
         return None
-    found: dict[str, Any] = {name.lower(): _numbers(value) for name, value in _OST_LINE.findall(text)}
+    found: dict[str, Any] = {name.lower(): numbers_in(value) for name, value in _OST_LINE.findall(text)}
     sides = {name: value[0] for name, value in found.items() if value and name != "distortion"}
-    return {"camera_matrix": _numbers(matrix[1]), "d": found.get("distortion"), **sides}
+    return {"camera_matrix": numbers_in(matrix[1]), "d": found.get("distortion"), **sides}
 
 
 def mapping_of_bouguet(text: str) -> dict[str, Any] | None:
     """Returns what ``Calib_Results.m`` of Bouguet's toolbox for MATLAB says, which counts pixels from 0; None of other texts."""
-    found = {name: _numbers(value.replace(";", " ").replace(",", " ")) for name, value in _BOUGUET.findall(text)}
+    found = {name: numbers_in(value.replace(";", " ").replace(",", " ")) for name, value in _BOUGUET.findall(text)}
     if any(len(found.get(name) or ()) != 2 for name in ("fc", "cc")):
         return None
     told: dict[str, Any] = dict(zip(("fx", "fy", "cx", "cy"), (*found["fc"], *found["cc"])))  # type: ignore[misc]
@@ -78,7 +78,7 @@ def without_matlab_counting(data: dict[str, Any]) -> dict[str, Any]:
     """Returns the names and numbers of MATLAB's ``cameraParameters`` (``toStruct``) as other tools have them: pixels count
     from 0, and the size is width and height. Other mappings stay as they are.
     """
-    own = {str(key).lower(): value for key, value in data.items()}
+    own = lower_keys(data)
     if "radialdistortion" not in own or not ({"focallength", "intrinsicmatrix", "k"} & set(own)):
         return data
     told = {key: own[key] for key in ("skew", "radialdistortion", "tangentialdistortion") if key in own}
@@ -97,7 +97,13 @@ def without_matlab_counting(data: dict[str, Any]) -> dict[str, Any]:
     return told | (dict(zip(("height", "width"), size)) if isinstance(size, list) and len(size) == 2 else {})
 
 
-def _numbers(text: str) -> list[float] | None:
+def lower_keys(mapping: dict[Any, Any]) -> dict[str, Any]:
+    """Returns the mapping with its own keys in small letters."""
+    return {str(key).lower(): value for key, value in mapping.items()}
+
+
+def numbers_in(text: str) -> list[float] | None:
+    """Returns the numbers of a text that holds nothing else, None of another one."""
     try:
         return [float(word) for word in text.split()] or None
     except ValueError:

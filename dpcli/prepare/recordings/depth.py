@@ -40,7 +40,7 @@ def read_recorded_depth(
         if read.frames[0].itemsize == 1 and not topic and not _SAYS_DEPTH.search(name):
             raise DataError(f"{path}: {name} holds 8-bit images, hardly depth; if they are, name it with --topic")
         cameras = _cameras(recording, name)
-        read.notes |= {CHANGES: 1} if any(one != cameras[0] for one in cameras) else {}
+        read.notes[CHANGES] = int(any(one != cameras[0] for one in cameras))
         return read, cameras[0] if cameras else None, _raw_units(recording, name)
 
 

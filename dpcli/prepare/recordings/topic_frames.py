@@ -53,12 +53,8 @@ def read_topic(recording: Recording, topic: str, stride: int, decode: Callable[[
     if not frames:
         raise DataError(f"{recording.path}: {topic} declares {counted(declared, 'message')} and holds none")
     order, time, notes = message_times(stamps)
-    if recording.read < declared:
-        notes[LACKING] = declared - recording.read
-    if recording.unlisted:
-        notes[UNLISTED] = len(recording.unlisted)
-    if len(places) > 1:
-        notes[SEVERAL_PLACES] = 1
+    notes |= {LACKING: max(declared - recording.read, 0), UNLISTED: len(recording.unlisted)}
+    notes[SEVERAL_PLACES] = int(len(places) > 1)
     return TopicFrames([frames[place] for place in order], time, notes)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -92,7 +92,6 @@ class ArraySequences(OwnScans):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Returns the optional fields that every sample has."""
         time, color = self._first
         return self.fields_beside(time=time, color=color)
 
@@ -190,16 +189,11 @@ class ArraySequences(OwnScans):
         return LabelTable(self.raw, rows, [str(k) for k in range(max(row.label for row in rows.values()) + 1)])
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         time, color = self._first
-        items = [
-            Item(one.name, one.path, extra={**one.extra, "time": time, "color": color}, problem=one.problem)
-            for one in self._items
-        ]
-        return self._table.apply(items)
+        told = {"time": time, "color": color}
+        return self._table.apply([replace(one, extra={**one.extra, **told}) for one in self._items])
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         with open_arrays(item.path) as arrays:
             stored = self._stored(item, arrays)
             frames, colors = stored.frames(), stored.colors()
@@ -232,9 +226,7 @@ class ArraySequences(OwnScans):
             cloud.keep(own)
         time = None if time is None else time[kept]
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= {MORE_FRAMES: more} if more else {}
-        sample.notes |= note_of_units(["points"], {"points": units})
-        sample.notes |= {UNCOUNTED: dropped} if dropped else {}
+        sample.note({MORE_FRAMES: more, **note_of_units(["points"], {"points": units}), UNCOUNTED: dropped})
         return sample
 
     def _column(self, stored: StoredSequence, name: str) -> np.ndarray:
@@ -242,7 +234,6 @@ class ArraySequences(OwnScans):
         return stored.column(name, "--track" if is_track else "--keep-fields", gaps=not is_track)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         files = len(self._paths)
         lines = [f"{counted(len(items), 'sequence')} in {counted(files, 'file')} of arrays"]
         good = next((item for item in items if not item.problem), None)

@@ -17,7 +17,7 @@ from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import Cloud, as_float32, without
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import CROWDED, clean, ends_of, is_crowded
 from dpcli.store import CloudSequence
 from dpcli.store.schema import METERS, kept_name, kept_names
@@ -71,7 +71,7 @@ class Lengths:
 
 
 @dataclass(frozen=True)
-class OwnScans:
+class OwnScans(Reader):
     """Holds what the readers of people's own scans share: their options and one check of these, the classes of their table of
     labels, the unit, and what the provenance tells.
 
@@ -116,17 +116,14 @@ class OwnScans:
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         return self._table.class_names
 
     @property
     def length_unit(self) -> str:
-        """Returns the name of the output's unit of length."""
         return self.unit
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         left_out = ("raw", "labels", *(() if self.track else ("track",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
@@ -146,15 +143,13 @@ def assemble(
     divisor, converted = lengths.divisor(filled)
     # the fullest has no padding
     crowded = any(is_crowded(cloud.points) for cloud in filled[:: -(-len(filled) // _JUDGED)])
-    notes |= {**dropped, **converted, **({CROWDED: 1} if crowded else {})}
-    if not color and (colored := sum(cloud.color is not None for cloud in filled)):
-        notes[UNREAD_COLORS] = colored
+    notes |= {**dropped, **converted, CROWDED: int(crowded)}
+    notes[UNREAD_COLORS] = 0 if color else sum(cloud.color is not None for cloud in filled)
     frames = [cloud.points for cloud in filled]
     each = np.array([ends_of(frame) for frame in frames])
     ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor
     points, shift = _joined(frames, divisor, ends)
-    if shift is not None:
-        notes[SHIFTED] = 1
+    notes[SHIFTED] = int(shift is not None)
     notes |= _rounded(frames, each, divisor, _COARSE if lengths.unit == "m" else np.inf)
     if lengths.unit == "m":
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
@@ -174,7 +169,7 @@ def assemble(
         extra=extra,
         **describe(item),
     )
-    notes |= {SCATTERED: 1} if _scatters(filled) else {}
+    notes[SCATTERED] = int(_scatters(filled))
     return Sample(sequence, notes)
 
 

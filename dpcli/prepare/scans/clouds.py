@@ -53,7 +53,6 @@ class CloudFolders(OwnScans):
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in super().config.items() if k != "pattern" or self.pattern}
 
     def _in_folders(self) -> tuple[list[str], str]:
@@ -105,7 +104,6 @@ class CloudFolders(OwnScans):
             return ""
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         color, unread, _ = self._first
         items, told = [], {"color": color, "timed": self._timed, "unread": unread}
         for relative, series in zip(self._relative, self._series, strict=True):
@@ -127,7 +125,6 @@ class CloudFolders(OwnScans):
             raise
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         series = item.extra["series"]
         paths = series.paths[:: self.stride]
         columns, notes = self._bin_columns(paths)
@@ -137,7 +134,7 @@ class CloudFolders(OwnScans):
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= notes
+        sample.note(notes)
         return sample
 
     def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:
@@ -151,7 +148,6 @@ class CloudFolders(OwnScans):
         return columns, {} if columns == 4 and sure else {note: 1}
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         frames = sum(len(item.extra["series"].names) for item in items)
         lines = [f"{counted(len(items), 'sequence')} of {counted(frames, 'frame')} found"]
         if self._first[1]:

@@ -9,12 +9,11 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.column_names import find_frame_column
+from dpcli.prepare.cloud_formats.column_names import Table, find_frame_column
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.scans.times_of_tables import (
     SHORTEST,
     Clock,
-    Table,
     calendar_seconds,
     clock_seconds,
     seconds_and_parts,

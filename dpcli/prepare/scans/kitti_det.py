@@ -11,13 +11,13 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.prepare.decode.png import png_size
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_known
 from dpcli.prepare.scans.kitti_files import (
+    COORDINATES,
     IMAGE_SIZE,
     OUTSIDE,
     View,
     calibration_matrix,
-    check_coordinates,
     check_objects,
     missing_files_problem,
     names_in,
@@ -110,7 +110,7 @@ def read_lists(folder: Path) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class KittiDetection:
+class KittiDetection(Reader):
     """Reads training/{velodyne,label_2,calib,image_2}; ``objects``: the types whose boxes are parts 1, 2, ...
 
     ``lists``: folder of train.txt and val.txt (the split of Chen et al. 2015, 3,712 and 3,769 scans); by default
@@ -122,22 +122,19 @@ class KittiDetection:
     objects: tuple[str, ...] = ("Car",)
     view: View = View()
     coordinates: str = "published"
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("part",)
 
     def __post_init__(self) -> None:
-        check_coordinates(self.coordinates)
+        require_known(self, coordinates=COORDINATES)
         check_objects(self.objects, TYPES)
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         view = {"near": self.view.near, "far": self.view.far}
         return {"objects": list(self.objects), **view, "coordinates": self.coordinates}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder, split = training_folder(self.raw, "velodyne"), self._split()
         names = names_in(folder / "velodyne", ".bin")
         if not names:
@@ -165,7 +162,6 @@ class KittiDetection:
         return found
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         scan = read_velodyne(item.path / "velodyne" / f"{item.name}.bin")
         path = item.path / "calib" / f"{item.name}.txt"
         found = read_calibration(path)
@@ -193,10 +189,9 @@ class KittiDetection:
         }
         cloud = orient_points(points, self.coordinates)
         sequence = CloudSequence.from_frames(item.name, [cloud], part=[part], **describe(item))
-        return Sample(sequence, {what: count for what, count in notes.items() if count})
+        return Sample(sequence, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in (*_SPLITS.values(), "")}
         lines = [
             f"{counted(len(items), 'scan')} ({counts['train']} train, {counts['validation']} validation, {counts['']} in no list)"

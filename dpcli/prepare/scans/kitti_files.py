@@ -20,12 +20,6 @@ COORDINATES = ("published", "camera")
 IMAGE_SIZE = (1242, 375)  # pixels, width and height of most of KITTI's pictures
 
 
-def check_coordinates(name: str) -> None:
-    """Raises UsageError unless it is one of COORDINATES."""
-    if name not in COORDINATES:
-        raise UsageError(f"--coordinates {name}: expected {' or '.join(COORDINATES)}")
-
-
 def check_objects(chosen: Collection[str], known: Collection[str]) -> None:
     """Raises UsageError unless some classes of objects are chosen, all of them known."""
     if not chosen or set(chosen) - set(known):

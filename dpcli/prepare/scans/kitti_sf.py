@@ -10,10 +10,10 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_known
 from dpcli.prepare.scans.kitti_files import (
+    COORDINATES,
     calibration_matrix,
-    check_coordinates,
     missing_files_problem,
     names_in,
     orient_points,
@@ -91,7 +91,7 @@ def class_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class KittiSceneFlow:
+class KittiSceneFlow(Reader):
     """Reads training/{disp_occ_0,disp_occ_1,flow_occ,instance,calib_cam_to_cam}.
 
     ``objects``: the classes whose instances are parts 1, 2, ...; all else is part 0. ``labels``: which images say so.
@@ -102,26 +102,21 @@ class KittiSceneFlow:
     labels: str = "instance"
     far: float = 35.0
     coordinates: str = "published"
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("part", "scene_flow")
 
     def __post_init__(self) -> None:
         class_numbers(self.objects)
-        check_coordinates(self.coordinates)
-        if self.labels not in LABELS:
-            raise UsageError(f"--labels {self.labels}: expected {' or '.join(LABELS)}")
+        require_known(self, coordinates=COORDINATES, labels=LABELS)
         if not self.far > 0:
             raise UsageError(f"--far {self.far}: expected a distance above 0, meters")
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         objects = {"objects": list(self.objects)} if self.labels == "instance" else {}
         return {"labels": self.labels, **objects, "far": self.far, "coordinates": self.coordinates}
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder = training_folder(self.raw, "flow_occ")
         names = names_in(folder / "flow_occ", "_10.png")
         if not names:
@@ -150,7 +145,6 @@ class KittiSceneFlow:
         return {**{key: folder / key / f"{name}_10.png" for key in images}, "calibration": chosen}
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         files = self._files(item.path, item.name)
         flow = read_png(files["flow_occ"], 3)
         size = flow.shape[:2]
@@ -170,7 +164,7 @@ class KittiSceneFlow:
         sequence = CloudSequence.from_frames(
             item.name, [first, second], part=[part, part], scene_flow=flows, **describe(item)
         )
-        return Sample(sequence, {} if part.any() else {"scenes without an object": 1})
+        return Sample(sequence, {"scenes without an object": int(not part.any())})
 
     def _parts(self, path: Path, size: tuple[int, int], pixel: np.ndarray) -> np.ndarray:
         """Returns i16 (N): 0 background, then one number for each object that has points."""
@@ -180,7 +174,6 @@ class KittiSceneFlow:
         return renumber_objects(ids)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         good = sum(not item.problem for item in items)
         train = sum(item.split == "train" for item in items)
         lines = [f"{good} of {counted(len(items), 'scene')} with all their files ({train} train)"]

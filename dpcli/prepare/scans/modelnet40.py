@@ -6,16 +6,16 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import h5py
 import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.path_names import first_names
-from dpcli.prepare.reader import Item, Sample, describe, natural_key, published_found, require_folder
+from dpcli.prepare.array_files.containers import own_data_set
+from dpcli.prepare.reader import Item, Reader, Sample, describe, natural_key, published_found, require_folder
 from dpcli.store import CloudSequence
-from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = tuple(
@@ -29,16 +29,9 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 
 
 def _read_array(path: Path, name: str) -> np.ndarray:
-    """Reads a data set of an HDF5 file. Raises DataError when absent, damaged, or kept in another file."""
     check_heaps(path)
     with reading(path), h5py.File(path, "r") as file:
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-            found = ", ".join(sorted(file)) or "none"
-            raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
-        if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
-            raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
-        refuse_claim(file[name], path)
-        return file[name][()]
+        return own_data_set(file, name, path)[()]
 
 
 @lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
@@ -58,17 +51,15 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class ModelNet40:
+class ModelNet40(Reader):
     """Reads the folder; a sample is a sequence of one frame."""
 
     raw: Path
     length_unit: ClassVar[str] = "unit sphere"
     fields: ClassVar[tuple[str, ...]] = ()
-    config: ClassVar[dict[str, Any]] = {}
 
     @property
     def class_names(self) -> list[str]:
-        """Returns the class names in the order of their labels."""
         path = self.raw / "shape_names.txt"
         if not path.is_file():
             return list(CLASS_NAMES)
@@ -78,7 +69,6 @@ class ModelNet40:
         return names
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder = require_folder(self.raw, _EXPECTED)
         there = {path.name: path for path in folder.iterdir() if _FILE.fullmatch(path.name)}
         splits = {name: _FILE.fullmatch(name)[1] for name in there}  # type: ignore[index]
@@ -112,7 +102,6 @@ class ModelNet40:
         return [_item(f"{stem}/{row:04d}", path, homes[0], (row, len(labels)), label) for row, label in rows]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         data, (row, labels) = _clouds(item.path), item.extra["row"]
         if row >= len(data):
             raise DataError(f"{item.path}: data has {len(data)} shapes, label has more; expected as many")
@@ -120,10 +109,9 @@ class ModelNet40:
             raise DataError(f"{item.path}: shape {row} holds NaN or infinity; expected finite coordinates")
         more = len(data) - labels if row == 0 else 0  # told once of a file
         sequence = CloudSequence.from_frames(item.name, [data[row].astype(np.float32)], **describe(item))
-        return Sample(sequence, {"shapes behind the last label left out": more} if more > 0 else {})
+        return Sample(sequence, {"shapes behind the last label left out": max(more, 0)})
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         lines = published_found(items, PUBLISHED, "shapes")
         files = (path.name for path in self.raw.glob("[!.]*") if path.suffix.lower() in (".h5", ".hdf5"))
         left = sorted(name for name in files if not _FILE.fullmatch(name))

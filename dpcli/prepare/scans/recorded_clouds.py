@@ -69,13 +69,11 @@ class RecordedClouds(OwnScans):
         return False, ()
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when there is no recording."""
         color, unread = self._first
         items = [Item(name, path, extra={"color": color, "unread": unread}) for name, path in self._names.items()]
         return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         with open_recording(item.path) as recording:
             topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
             read = read_topic(
@@ -87,11 +85,10 @@ class RecordedClouds(OwnScans):
         if time is None:
             raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= read.notes
+        sample.note(read.notes)
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds."""
         unread = f"; not read: {first_names(self._first[1], _LISTED)} (--keep-fields)" if self._first[1] else ""
         lines = [f"{counted(len(items), 'recording')} found{unread}"]
         if others := unread_recordings(self.raw):

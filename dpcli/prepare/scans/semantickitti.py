@@ -12,13 +12,13 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
-from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_folder, require_known, require_least
 from dpcli.prepare.scans.kitti_files import (
+    COORDINATES,
     IMAGE_SIZE,
     OUTSIDE,
     View,
     calibration_matrix,
-    check_coordinates,
     check_objects,
     is_no_camera,
     names_in,
@@ -89,7 +89,7 @@ def _labels_without_scan(folder: Path) -> list[str]:
 
 
 @dataclass(frozen=True)
-class SemanticKitti:
+class SemanticKitti(Reader):
     """Reads sequences/SS/{velodyne,labels,calib.txt,poses.txt}.
 
     ``group``: which of GROUPS; ``frames`` successive scans are one sample, windows don't overlap; ``align`` moves them
@@ -103,21 +103,18 @@ class SemanticKitti:
     objects: tuple[str, ...] = ("car", "truck")
     view: View = View()
     coordinates: str = "published"
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("part",)
 
     def __post_init__(self) -> None:
-        check_coordinates(self.coordinates)
+        require_known(self, coordinates=COORDINATES)
         if self.group not in GROUPS:
             raise UsageError(f"--group {self.group}: expected {', '.join(GROUPS)}")
         check_objects(self.objects, CLASSES)
-        if self.frames < 1:
-            raise UsageError(f"--frames {self.frames}: expected 1 or more")
+        require_least(self, frames=1)
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         own = {"group": self.group, "frames": self.frames, "align": self.align, "objects": list(self.objects)}
         return {**own, "near": self.view.near, "far": self.view.far, "coordinates": self.coordinates}
 
@@ -133,7 +130,6 @@ class SemanticKitti:
         )
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
         for sequence, folder in self._folders():
             scans = names_in(folder / "velodyne", ".bin")
@@ -159,7 +155,6 @@ class SemanticKitti:
         return ""
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         path = item.path / "calib.txt"
         if not path.is_file():
             raise DataError(f"{path}: missing; the crop to the camera's view needs it")
@@ -179,8 +174,8 @@ class SemanticKitti:
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
-        notes |= {} if part.any() else {"samples without an object": 1}
-        return Sample(sequence, {what: count for what, count in notes.items() if count})
+        notes["samples without an object"] = int(not part.any())
+        return Sample(sequence, notes)
 
     def _scan(
         self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray | None
@@ -214,7 +209,6 @@ class SemanticKitti:
         return np.linalg.inv(poses[numbers[0]]) @ poses[numbers]
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         held = sum(len(names_in(folder / "velodyne", ".bin")) for _, folder in self._folders())
         found = [name for name, _ in self._folders()]
         lines = [f"{counted(len(items), 'sample')} of {counted(self.frames, 'scan')}, sequences {', '.join(found)}"]

@@ -17,6 +17,7 @@ from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.cloud_formats.column_names import (
     ROWS_ARE_FRAMES,
+    Table,
     find_frame_column,
     find_further_points,
     find_recording_columns,
@@ -67,8 +68,7 @@ class TableSequences(OwnScans):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Returns the optional fields that every sample has."""
-        color, time = self._found
+        time, color = self._first
         return self.fields_beside(time=time, color=color)
 
     @cached_property
@@ -90,16 +90,16 @@ class TableSequences(OwnScans):
         return named_below(self.raw, found, "table")
 
     @cached_property
-    def _found(self) -> tuple[bool, bool]:
-        """Returns whether the first good table has colors and whether its frames have times."""
+    def _first(self) -> tuple[bool, bool]:
+        """Returns whether the frames of the first good table have times, and whether it has colors."""
         for path in self._paths.values():
             try:
                 loaded = self._load(path)
             except DataError:
                 continue  # a bad sample: the next one tells
             timed = all(loaded.times(part, self.fps) is not None for part in loaded.parts)
-            return loaded.cloud.color is not None, timed
-        return False, bool(self.fps)
+            return timed, loaded.cloud.color is not None
+        return bool(self.fps), False
 
     def _in_folders(self) -> tuple[list[str], str]:
         return [item.name for item in self._items], "CLASS/TABLE"
@@ -107,6 +107,7 @@ class TableSequences(OwnScans):
     @cached_property
     def _items(self) -> list[Item]:
         items = []
+        time, color = self._first
         for name, path in self._paths.items():
             try:
                 parts = self._load(path).parts
@@ -115,12 +116,11 @@ class TableSequences(OwnScans):
                 continue
             for place, part in enumerate(parts):
                 own = f"{name}/{as_utf8(part.name)}" if part.name else name
-                extra = {"part": place, "color": self._found[0], "time": self._found[1]}
+                extra = {"part": place, "time": time, "color": color}
                 items.append(Item(own, path, extra=extra))
         return items
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         return self._table.apply(self._items)
 
     def _load(self, path: Path) -> Loaded:
@@ -128,7 +128,6 @@ class TableSequences(OwnScans):
         return _load(self, path, facts.st_size, facts.st_mtime_ns)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         loaded = self._load(item.path)
         part = loaded.parts[item.extra["part"]]
         if item.extra["color"] and loaded.cloud.color is None:
@@ -144,27 +143,26 @@ class TableSequences(OwnScans):
             dropped = {what: count for what, count in dropped.items() if what != EMPTY}
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.notes |= dropped | {note: 1 for note in part.notes} | ({JOINED: part.joined} if part.joined else {})
         silent = 0 if time is not None or part.joined else part.silent
-        sample.notes |= {SILENT: silent} if silent else {}
+        sample.note({**dropped, **{note: 1 for note in part.notes}, JOINED: part.joined, SILENT: silent})
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
-        sample.notes |= {MIXED.format(mixed): 1} if mixed else {}
+        if mixed:
+            sample.note({MIXED.format(mixed): 1})
         further = [] if self.track == COLUMNS else find_further_points(without(loaded.unused, self.keep))
         if further:
-            sample.notes |= {WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1}
+            sample.note({WIDE.format(", ".join(loaded.cloud.columns[:3]), ", ".join(further)): 1})
         elif len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds):
-            sample.notes |= {SINGLE: 1}
+            sample.note({SINGLE: 1})
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         tables = len(self._paths)
         lines = [f"{counted(len(items), 'sequence')} in {counted(tables, 'table')}"]
         good = next((item for item in items if not item.problem), None)
         if good:
             loaded = self._load(good.path)
             first = loaded.parts[0]
-            used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
+            used = self._first[0] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
             clock = used.columns if used else ()
             unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, self.track, *clock))
             lines[0] += f", frames by column {loaded.column!r}" if loaded.column else ", a frame in each row"
@@ -253,7 +251,7 @@ def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loade
     return Loaded(cloud, parts, column, unused, clocks, recordings)
 
 
-def open_table(path: Path) -> TextTable | ParquetTable | ArrayTable:
+def open_table(path: Path) -> Table:
     """Returns the table in a file of any format. Raises DataError where it holds none."""
     suffix = path.suffix.lower()
     return (

@@ -7,13 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import partial
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.column_names import SECONDS, seconds_in_brackets, words_of
+from dpcli.prepare.cloud_formats.column_names import SECONDS, Table, seconds_in_brackets, words_of
 from dpcli.runtime.clips.name_numbers import is_ticks
 
 _EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
@@ -38,25 +36,6 @@ _TICK = 1e-7
 _DAYS = ((36_526, 54_788), (730_486, 748_749))  # 2000 to 2050 as spreadsheets and as MATLAB count days
 _FASTEST = 0.002  # seconds between frames: smaller steps of such numbers are days
 _BEYOND = 5  # steps that may be missing where a minute ends; as many would lie between its 60th and 100th second
-
-
-class Table(Protocol):
-    """Offers the columns of a table, as `text_numbers.TextTable` and `parquet.ParquetTable` do."""
-
-    path: Path
-    names: tuple[str, ...]
-
-    def columns(self, places: list[int]) -> np.ndarray:
-        """Returns some columns as numbers f64 (N,k). Raises DataError where they hold none."""
-        ...
-
-    def words(self, place: int) -> list[str]:
-        """Returns the cells of a column as text, "" of an empty one."""
-        ...
-
-    def moments(self, place: int) -> np.ndarray | None:
-        """Returns the seconds f64 (N) of a column whose type is time; None of other types, such as texts."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.column_names import Table
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.assembling import OwnScans
-from dpcli.prepare.scans.times_of_tables import Table
 from dpcli.store import CloudSequence
 from dpcli.store.views import ViewsReader
 
@@ -156,7 +156,6 @@ class TrackedViews(OwnScans):
         return self._table.apply(items)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample. Raises DataError when its data are bad."""
         with ViewsReader(item.path) as views:
             track, part = views.track[:: self.stride], views.part
             time = views.header.time[:: self.stride]
@@ -173,7 +172,6 @@ class TrackedViews(OwnScans):
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the file holds."""
         with ViewsReader(self.raw) as views:
             frames, points = views.track.shape[:2]
         return [f"the true tracks of {counted(points, 'point')} in {counted(frames, 'frame')} of views"]

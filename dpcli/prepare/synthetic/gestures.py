@@ -6,16 +6,15 @@ ignores the order of frames cannot tell them apart: what it gains over chance is
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.errors import UsageError
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
-from dpcli.prepare.reader import Item, Sample, sample_of_frames
+from dpcli.prepare.reader import Item, Reader, Sample, require_least, sample_of_frames
 from dpcli.prepare.synthetic.human_figure import Figure, capsules
 from dpcli.prepare.synthetic.virtual_depth_camera import add_noise, render
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -96,7 +95,7 @@ def time_warp(frames: int, pause: float, rng: np.random.Generator) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class SyntheticGestures:
+class SyntheticGestures(Reader):
     """Makes gestures. ``size``: image width in pixels (the height is 3/4 of it)."""
 
     videos_per_class: int = 20
@@ -110,15 +109,7 @@ class SyntheticGestures:
     fields: ClassVar[tuple[str, ...]] = ("time", "part")
 
     def __post_init__(self) -> None:
-        for option, least in (("videos_per_class", 1), ("frames", 2), ("subjects", 2), ("size", 16)):
-            value = getattr(self, option)
-            if value < least:
-                raise UsageError(f"--{option.replace('_', '-')} {value}: expected {least} or more")
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return asdict(self)
+        require_least(self, videos_per_class=1, frames=2, subjects=2, size=16)
 
     @property
     def seen_subjects(self) -> int:
@@ -131,7 +122,6 @@ class SyntheticGestures:
         return max(1, min(self.seen_subjects - 1, round(0.6 * self.seen_subjects)))
 
     def items(self) -> list[Item]:
-        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         return [
             self._item(label, 1 + number % self.subjects, number)
             for number in range(self.videos_per_class)
@@ -144,7 +134,6 @@ class SyntheticGestures:
         return Item(name, Path(name), split=split, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when its data are bad."""
         subject = draw_subject(self.seed, item.subject)
         starts, ends = self._animate(subject, item.label, rng)
         height, width = self.size * 3 // 4, self.size
@@ -176,7 +165,6 @@ class SyntheticGestures:
         return to_camera(starts, yaw, place), to_camera(ends, yaw, place)
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds and lacks."""
         seen, train = self.seen_subjects, self.train_subjects
         split = f"subjects 1-{train} of {seen} train, the others test"
         if seen == 1:

@@ -64,7 +64,6 @@ class RadarGestures(SyntheticGestures):
 
     @property
     def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
         return {**super().config, "sensor": "radar"}
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

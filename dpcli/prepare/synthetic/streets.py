@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import Item, Reader, Sample, describe, require_least
 from dpcli.prepare.synthetic.spinning_lidar import LIDARS, scan
 from dpcli.prepare.synthetic.street_world import Mover, draw_movers, planar_pose, standing_street
 from dpcli.store import CloudSequence
@@ -20,7 +20,7 @@ _LANE = 1.75  # meters that the lidar's car drives beside the middle
 
 
 @dataclass(frozen=True)
-class SyntheticStreets:
+class SyntheticStreets(Reader):
     """Makes streets. ``rows``: beams of the lidar; ``movers``: the most moving bodies; ``speed``: fastest own, m/s.
 
     Part 0 is all that stands; a pose takes a part to the lidar's own coordinates of a frame (x ahead, z up).
@@ -35,30 +35,20 @@ class SyntheticStreets:
     noise: float = 0.02
     dropout: float = 0.05
     seed: int = 0
-    class_names: ClassVar[tuple[str, ...]] = ()
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose", "time")
 
     def __post_init__(self) -> None:
-        for option, least in (("streets", 1), ("frames", 1), ("movers", 0)):
-            if getattr(self, option) < least:
-                raise UsageError(f"--{option} {getattr(self, option)}: expected {least} or more")
+        require_least(self, streets=1, frames=1, movers=0)
         if self.rows not in LIDARS:
             raise UsageError(f"--rows {self.rows}: expected {', '.join(map(str, LIDARS))}")
         if not (self.rate > 0 and 0 <= self.dropout < 1 and self.noise >= 0 and self.speed >= 0):
             raise UsageError("--rate must be above 0, --dropout in 0..1, --noise and --speed 0 or more")
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Returns the options that decide the content, for the provenance."""
-        return asdict(self)
-
     def items(self) -> list[Item]:
-        """Returns the index in its final order."""
         return [Item(f"street_{number:04}", Path("street"), split="test") for number in range(self.streets)]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """Returns the sample of one item. Raises DataError when nothing is seen."""
         standing, lidar = standing_street(rng), LIDARS[self.rows]
         movers = draw_movers(int(rng.integers(min(1, self.movers), self.movers + 1)), rng)
         drive = (np.array([0, -_LANE]), rng.normal(0, 0.05), rng.uniform(0, self.speed), rng.normal(0, 0.05))
@@ -90,7 +80,6 @@ class SyntheticStreets:
         return poses
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Returns lines for the log about what the index holds."""
         counts = Counter(item.split for item in items)
         return [
             f"{counted(counts['test'], 'street')}, {counted(self.frames, 'frame')} of a lidar with {self.rows} beams"

@@ -14,6 +14,7 @@ from dpcli.ops.cameras import orbit_of
 from dpcli.path_names import first_names
 from dpcli.prepare.bounding_sphere import bounding_sphere
 from dpcli.prepare.decode.color_frames import read_rgba
+from dpcli.prepare.reader import ON_ERROR, require_known
 from dpcli.prepare.views.artemis_files import (
     Motion,
     Rig,
@@ -44,7 +45,8 @@ _INSIDE = 0.7  # of the true tracks have to fall on the object; else cameras and
 class ArtemisOptions:
     """Says what is taken of an animal.
 
-    Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number.
+    Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number. Raises UsageError on values that make
+    no sense.
     """
 
     motion: str
@@ -59,19 +61,16 @@ class ArtemisOptions:
     on_error: str = "stop"
     seed: int = 0
 
-    def check(self) -> None:
-        """Raises UsageError on values that make no sense."""
+    def __post_init__(self) -> None:
         if not 0 <= self.border <= 0.9:
             raise UsageError(f"--border {self.border:g}: expected 0 to 0.9")
         if not 0 < self.fps < 10_000:
             raise UsageError(f"--fps {self.fps:g}: expected frames per second, above 0")
-        if self.on_error not in ("skip", "stop"):
-            raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
+        require_known(self, on_error=ON_ERROR)
 
 
 def artemis_config(animal: Path, options: ArtemisOptions) -> dict[str, Any]:
     """Returns options and a digest of cameras and bones, for provenance (the pictures are too many to read twice)."""
-    options.check()
     motion = find_motion(animal, options.motion)
     small = [animal / "CamPose.inf", animal / "Intrinsic.inf"]
     small += sorted((animal / "bones" / options.motion).glob("Bones_*.inf"))
@@ -89,7 +88,6 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
     object's bounding sphere over all frames has radius 0.75 around the origin: from the skinned voxels where the
     folder has them, else from the silhouettes of the first frame. Each camera has one square crop around the object over all frames.
     """
-    options.check()
     motion, rig = find_motion(animal, options.motion), read_rig(animal)
     declared = declared_frames(animal).get(motion.name, 0)
     if declared > len(motion.folders):

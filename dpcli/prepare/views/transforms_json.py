@@ -48,7 +48,6 @@ def transforms_config(path: Path, options: VideoOptions, *, quiet: bool = True) 
 
 
 def _check(options: VideoOptions) -> None:
-    options.check()
     if options.views or options.mask or options.pattern:
         raise UsageError(
             "--views, --mask and --pattern belong to clips without cameras; transforms_*.json lists all views itself"

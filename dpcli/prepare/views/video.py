@@ -24,7 +24,7 @@ from dpcli.prepare.decode.color_frames import (
     open_frames,
     read_rgba,
 )
-from dpcli.prepare.reader import require_folder
+from dpcli.prepare.reader import ON_ERROR, require_folder, require_known
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.cameras_beside import tell_cameras_beside
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
@@ -42,7 +42,10 @@ _ANNOTATIONS = (".json", ".txt", ".xml", ".npy", ".npz")  # of LabelMe, YOLO, CV
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """Says how a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder."""
+    """Says how a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder.
+
+    Raises UsageError on values that make no sense.
+    """
 
     frames: int = 32
     size: int = 512
@@ -62,8 +65,7 @@ class VideoOptions:
     views: Path | None = None
     views_cameras: Path | None = None
 
-    def check(self) -> None:
-        """Raises UsageError on values that make no sense, before any file is opened."""
+    def __post_init__(self) -> None:
         for option, value, low, high in (
             ("--border", self.border, 0.0, 0.9),
             ("--tolerance", self.tolerance, 0.0, 0.5),
@@ -74,8 +76,7 @@ class VideoOptions:
             raise UsageError("--radius > 0, --fovy between 0 and 180 and --elevation within +-90 degrees expected")
         if self.fps is not None and not 0 < self.fps < 10_000:
             raise UsageError(f"--fps {self.fps:g}: expected frames per second, above 0")
-        if self.on_error not in ("skip", "stop"):
-            raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
+        require_known(self, on_error=ON_ERROR)
         if self.holes not in matting.HOLES:
             raise UsageError(f"--holes {self.holes}: expected {', '.join(matting.HOLES)}")
         if self.mask and self.background != "auto":
@@ -103,7 +104,6 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
 
     Raises DataError on frames that can't be used; the log says what was chosen.
     """
-    options.check()
     frames = open_frames(path, options.pattern)
     tell_cameras_beside(path, options.views_cameras)
     cutter, wanted, crop, size = _plan_clip(frames, options)
@@ -143,7 +143,6 @@ def clip_name(path: Path) -> str:
 
 def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     """Returns options and digests of everything read, for provenance: equal configurations give equal files."""
-    options.check()
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
     if not options.pattern:
         del config["pattern"]

@@ -252,6 +252,26 @@ def test_truncated_mat_73(tmp_path):
         one(tmp_path)
 
 
+@pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
+def test_nothing_is_read_from_the_files_that_a_mat_73_names(tmp_path, kind):
+    other = tmp_path / "other"
+    with h5py.File(other, "w") as file:
+        file["depth"] = np.ones((2, 8, 6), np.uint16)
+    with h5py.File(tmp_path / "a01_s01_e01_sdepth.mat", "w", userblock_size=512) as file:
+        if kind == "link":
+            file["depth"] = h5py.ExternalLink(str(other), "depth")
+        elif kind == "storage":
+            file.create_dataset("depth", (2, 8, 6), "u2", external=[(str(other), 0, 192)])
+        else:
+            layout = h5py.VirtualLayout((2, 8, 6), "u2")
+            layout[:] = h5py.VirtualSource(str(other), "depth", (2, 8, 6))
+            file.create_virtual_dataset("depth", layout)
+    with (tmp_path / "a01_s01_e01_sdepth.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file")
+    with pytest.raises(DataError, match="of its own; found depth|keeps its data in another file"):
+        one(tmp_path)
+
+
 def test_frames_without_depth_are_dropped_and_counted(tmp_path):
     depth = make_depth(0, frames=4)
     depth[[0, 2]] = 0

@@ -213,6 +213,19 @@ def test_what_lies_in_another_file_is_named_and_not_followed(tmp_path):
     assert "not read: points (in b.h5)" in reader.summary(reader.items())[0]
 
 
+def test_what_a_cell_holds_is_not_read_from_another_file(tmp_path):
+    clouds().tofile(tmp_path / "b.raw")
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        size = clouds()[0].nbytes
+        for t in range(5):
+            place = [(str(tmp_path / "b.raw"), t * size, size)]
+            file.create_dataset(f"#refs#/{t}", clouds()[0].shape, clouds().dtype, external=place)
+        file["walk"] = np.array([[file[f"#refs#/{t}"].ref for t in range(5)]], h5py.ref_dtype)
+        file["walk"].attrs["MATLAB_class"] = np.bytes_("cell")
+    (item,) = ArraySequences(tmp_path / "a.mat").items()
+    assert "/#refs#/0 keeps its data in another file" in item.problem
+
+
 def test_a_unit_may_be_called_unit(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["points"] = clouds() * 1000

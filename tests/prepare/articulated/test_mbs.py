@@ -191,6 +191,8 @@ def test_splits_of_meta_json_in_other_words_and_samples_in_none(tmp_path, keys):
     assert [(i.name, i.split) for i in items] == [(f"{k:06d}", ("train", "validation", "test")[k]) for k in known]
     left = ", ".join(f"{k:06d}" for k in range(4) if k not in known)
     assert reader.summary(items)[-1] == f"not read, in no split of meta.json: {left}"
+    (raw / "meta.json").write_text('{"train": [3]}')  # what comes later in the same process is found, too
+    assert [item.name for item in MultiBodySync(raw).items()] == ["000003"]
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,8 @@ def test_rooms_in_no_list_are_named(tmp_path):
     rooms = {f"3_00000{k}": make_room(k)[0] for k in range(3)}
     reader = OgcRooms(write_raw(tmp_path, rooms, train=["3_000001"]))
     assert reader.summary(reader.items())[-1] == "not read, in no list: 3_000000, 3_000002"
+    write_raw(tmp_path, {}, val=["3_000000"])  # what comes later in the same process is found, too
+    assert [item.name for item in OgcRooms(tmp_path).items()] == ["3_000001", "3_000000"]
 
 
 def test_a_list_cannot_lead_out_of_the_folder(tmp_path):

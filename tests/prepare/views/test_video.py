@@ -471,7 +471,7 @@ def test_keep_takes_the_whole_picture(tmp_path):
 )
 def test_wrong_options_are_wrong_use(options):
     with pytest.raises(UsageError):
-        VideoOptions(**options).check()
+        VideoOptions(**options)
 
 
 @given(st.integers(1, 500), st.integers(0, 100))

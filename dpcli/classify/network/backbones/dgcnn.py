@@ -213,7 +213,6 @@ class DGCNN(Backbone):
         return [Grouping(points, times, points, times, self._graph(points, times))]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Returns class logits (B,C)."""
         group = groups[0]
         features, levels = self.transform(group.points, group.idx), []
         for conv in self.convs:

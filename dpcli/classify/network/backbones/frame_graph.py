@@ -173,7 +173,6 @@ class _PooledByKernel(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes the result, and keeps what the gradient needs."""
         from dpcli.ops.cpu.frame_graph import pool_kernel
 
         shape, cost = (*idx.shape[:2], values.shape[2]), idx.shape[2] * values.shape[2] * _POOL_NS
@@ -186,7 +185,6 @@ class _PooledByKernel(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, to_largest: Tensor, to_total: Tensor) -> tuple[Tensor, None]:
-        """Returns the gradients of the inputs."""
         from dpcli.ops.cpu.frame_graph import pool_back_kernel
 
         values, idx, largest = ctx.saved_tensors
@@ -201,7 +199,6 @@ class _PooledEdges(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes the result, and keeps what the gradient needs."""
         parts = []
         for piece in rows.split(_rows_a_piece(values, rows)):
             gathered = values.index_select(0, piece.reshape(-1)).view(*piece.shape, -1)
@@ -213,7 +210,6 @@ class _PooledEdges(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, to_largest: Tensor, to_total: Tensor) -> tuple[Tensor, None]:
-        """Returns the gradients of the inputs."""
         values, rows, largest = ctx.saved_tensors
         out, step = torch.zeros_like(values), _rows_a_piece(values, rows)
         pieces = (part.split(step) for part in (rows, largest, to_largest, to_total))

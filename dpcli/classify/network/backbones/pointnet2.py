@@ -85,7 +85,6 @@ class PointNet2(Backbone):
         return group_clip(points, times, config, reaches)
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Returns class logits (B,C)."""
         features = self.stage2(groups[1], self.stage1(groups[0], None))
         return self.head(groups[1].centers, features)
 

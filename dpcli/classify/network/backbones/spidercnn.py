@@ -86,7 +86,6 @@ class _RankedProducts(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, gathered: Tensor, taylor: Tensor, kernel: Tensor) -> Tensor:
-        """Computes the result, and keeps what the gradient needs."""
         ctx.save_for_backward(gathered, taylor, kernel)
         batch, count = gathered.shape[:2]
         out = gathered.new_zeros(batch * count, kernel.shape[-1])
@@ -106,7 +105,6 @@ class _RankedProducts(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the gradients of the inputs."""
         gathered, taylor, kernel = ctx.saved_tensors
         to_gathered, to_taylor = (torch.empty_like(value) for value in (gathered, taylor))
         grad = grad.reshape(-1, grad.shape[-1])
@@ -204,7 +202,6 @@ class SpiderCNN(Backbone):
         return [Grouping(points, times, points, times, idx)]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Returns class logits (B,C)."""
         group, levels = groups[0], []
         features, offsets = group.points, monomials(group.relative())
         for conv in self.convs:

@@ -97,7 +97,6 @@ def video(
     from dpcli.prepare.views.video import VideoOptions, video_clip, video_config
 
     options = VideoOptions(**vars(pictures), **vars(cut_out), **vars(orbit))
-    options.check()
     if check:
         from dpcli.prepare.views.views_check import ClipIndex
 
