@@ -211,7 +211,7 @@ class DepthVideos:
         if not counts.any() and (seen > 0).any():
             raise DataError(f"{item.path}: {self._nothing_left(seen[seen > 0] / scale)}")
         require_plausible(str(item.path), points[:, 2], scale, asked=told)
-        if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
+        if item.extra["recording"] and not (video.camera or self._given_camera):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return sample_of_frames(item, points, counts, notes, time=self._times(item, video))
 
@@ -228,7 +228,9 @@ class DepthVideos:
             return read_depth_video(item.path, self.stride, item.extra["series"])
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
-        read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
+        read, camera, scale = read_recorded_depth(
+            item.path, self.topic, self.stride, with_camera=not self._given_camera
+        )
         scale = None if read.frames[0].dtype.kind == "f" else scale  # these are meters
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
@@ -247,6 +249,10 @@ class DepthVideos:
             )
             raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
         return video.time
+
+    @property
+    def _given_camera(self) -> bool:
+        return bool(self.intrinsics or self.calibration or self.fov)
 
     @property
     def _declared_scale(self) -> float | None:
@@ -280,7 +286,7 @@ class DepthVideos:
 
     def _camera(self, width: int, height: int, recorded: Calibration | None) -> Intrinsics:
         """Returns the user's camera, or the one that a recording describes, or one of a usual field of view."""
-        calibration = self.calibration or (None if self.intrinsics or self.fov else recorded)
+        calibration = self.calibration or (None if self._given_camera else recorded)
         if calibration:
             return calibration.of_pictures(width, height)
         return self.intrinsics or Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
@@ -294,8 +300,7 @@ class DepthVideos:
             lines.append(f"not read: {first_names(unread)}")
         if left_out := self._chosen[1]:
             lines.append(f"left out, by their names beside depth: {first_names(left_out)}")
-        unknown = not (self.intrinsics or self.calibration or self.fov)
-        if unknown and not all(item.extra["recording"] for item in items):
+        if not self._given_camera and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
                 " where a file tells none"
