@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +17,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
+    doubts_of_place,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -58,6 +58,7 @@ _OTHER_PICTURES = re.compile(
     r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
+_ALIGNED = re.compile(r"align|regist|depth_?(2|to)_?(colou?r|rgb)", re.IGNORECASE)
 _CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz")  # points, not pictures
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
@@ -136,7 +137,7 @@ class DepthVideos:
         values = {k: v for k, v in asdict(self).items() if k not in apart}
         given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern, "topic": self.topic}
         if self.calibration:
-            given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k != "source"}
+            given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k not in ("source", "chosen")}
         return {**values, "far": self.far if np.isfinite(self.far) else None, **{k: v for k, v in given.items() if v}}
 
     @property
@@ -192,12 +193,22 @@ class DepthVideos:
         series: Series | None = item.extra["series"]
         name = f"{item.name} {series.pattern if series else ''}"
         require_depth(item.path, name)
+        if self.calibration and self.calibration.chosen and _ALIGNED.search(name):
+            raise DataError(
+                f"{item.path}: by its name its depth was aligned to the color camera, but of the cameras in"
+                f" {self.calibration.source} the one called {self.calibration.chosen} is taken; expected --intrinsics of the color"
+                " camera: save it as a file of its own"
+            )
         video = self._video(item)
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
-        notes |= doubts_of_name(name) | video.notes | ({} if told else doubts_of_units(depth))
+        notes |= (
+            doubts_of_name(name)
+            | video.notes
+            | ({} if told else doubts_of_units(depth) or doubts_of_place(item.path, depth))
+        )
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
@@ -344,12 +355,13 @@ def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:
     return {
         path
         for path, series in videos.items()
-        if any(
-            part.parent in with_depth and _OTHER_PICTURES.search(part.stem) and not says_depth(part.stem)
-            for part in (path, *path.parents)
-        )
+        if any(part.parent in with_depth and _says_other(part.stem) for part in (path, *path.parents))
         or (series and not says_depth(path.stem) and len(series.names) > 1 and (path.parent, series.stems) in frames)
     }
+
+
+def _says_other(name: str) -> bool:
+    return _OTHER_PICTURES.search(name) is not None and not says_depth(name)
 
 
 def _not_read(root: Path, clips: Collection[Path]) -> list[str]:
@@ -384,11 +396,19 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     clips = {os.fspath(recording) for recording, _ in found}
     # frames are many: they are neither sorted nor asked what they are
     for folder, folders, files in walk_folders(path):
+        depth_beside = any(says_depth(name) for name in folders)
         for name in folders:
-            with suppress(PermissionError):  # it is told as skipped
-                if series := frame_series(Path(folder, name), pattern):
-                    found.append((Path(folder, name), with_times(series, path)))
+            own = Path(folder, name)
+            try:
+                if series := frame_series(own, pattern):
+                    found.append((own, with_times(series, path)))
                     clips.add(os.path.join(folder, name))
+            except PermissionError:  # it is told as skipped
+                pass
+            except DataError:  # nobody has to choose among the masks of each object beside depth
+                if not (depth_beside and _says_other(name)):
+                    raise
+                found.append((own, None))
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))

@@ -32,7 +32,7 @@ _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
 _CX = ("cx", "ppx", "c_x", "mx_depth")
 _CY = ("cy", "ppy", "c_y", "my_depth")
 _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
-_MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
+_MATRIX += ("m_calibrationdepthintrinsic", _BOP := "cam_k")  # of ScanNet's recordings, and of BOP's scenes
 _SIZE_OF = (
     "^(m|camera|cam|sensor)?(depth|ir|image|img|picture|frame|resolution|{})*"  # and before the names of both sides
 )
@@ -53,6 +53,7 @@ _COLMAP = {
     "OPENCV": 8,
     "FULL_OPENCV": 12,
 }  # how many parameters
+_DEEPEST = 6  # entries within one another
 _FEWEST_TERMS = 4  # of a lens
 _MOST_NUMBERS = 64  # in an array
 _MOST_PIXELS = 1_000_000  # of a side of a picture
@@ -278,7 +279,7 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
             " camera's SDK reports them for the depth mode"
         )
     data = without_matlab_counting(_with_numbers(data))
-    own = _camera_of(path, data)
+    chosen, own = _camera_of(path, data)
     if are_numbers([own.get("skew", 0)]) and own.get("skew"):
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
     lens = lens_of_mapping(path, own)
@@ -289,27 +290,37 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
     if cut and are_numbers(cut) and all(cut[2:]):
         numbers[2:], size = [numbers[2] - cut[0], numbers[3] - cut[1]], _pixel_counts(path, *cut[2:])
     scale = _depth_scale(path, own, data)
-    return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
+    return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path), chosen)
 
 
-def _camera_of(path: Path, data: dict[str, Any]) -> dict[str, Any]:
-    """Returns the mapping that holds intrinsics, in small letters: the whole, or the part of the depth camera."""
+def _camera_of(path: Path, data: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Returns the mapping that holds intrinsics, in small letters: the whole, the only one, one of several that are equal, or the
+    part of the depth camera; before it its name where others differ.
+    """
     found = list(_cameras("", data, {}))
-    depth = [part for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
-    if len(found) == 1 or (found and found[0][0] == ""):
-        return found[0][1]
-    if len(depth) == 1:
-        return depth[0]
     if not found:
         require_pinhole(path, {str(key).lower(): value for key, value in data.items()})
         raise DataError(f"{path}: {_EXPECTED}")
+    if len(found) == 1 or found[0][0] == "":
+        return "", found[0][1]
+    depth = [(name, part) for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
+    alike = depth or found
+    if all(_same_camera(path, part, alike[0][1]) for _, part in alike[1:]):
+        return ("" if len(alike) == len(found) else alike[0][0]), alike[0][1]
     names = ", ".join(name for name, _ in found[:5])
     raise DataError(f"{path}: holds several cameras ({names}); expected one, or one called depth")
 
 
+def _same_camera(path: Path, part: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Returns whether two mappings hold one camera, as where a file repeats it for every frame."""
+    return part == other or all(read(path, part) == read(path, other) for read in (_pixels, lens_of_mapping))
+
+
 def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yields every mapping that holds intrinsics, with what is said around it, such as the size of the pictures."""
-    if isinstance(data, dict) and depth < 5:
+    if depth == _DEEPEST:
+        return
+    if isinstance(data, dict):
         own = {str(key).lower(): value for key, value in data.items()}
         around = {**outer, **{key: value for key, value in own.items() if not isinstance(value, dict)}}
         if _holds_camera(own):
@@ -318,6 +329,9 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
             beside = [other for said, other in data.items() if _is_lens_of(str(said), str(key))]
             lens = {"distortion": beside[0]} if beside else {}
             yield from _cameras(f"{name}/{key}".lstrip("/"), value, {**around, **lens}, depth + 1)
+    elif isinstance(data, list):
+        for place, value in enumerate(data):
+            yield from _cameras(f"{name}/{place}", value, outer, depth + 1)
 
 
 def _is_lens_of(key: str, camera: str) -> bool:
@@ -330,7 +344,8 @@ def _is_lens_of(key: str, camera: str) -> bool:
 
 def _holds_camera(part: dict[str, Any]) -> bool:
     matrix = first(part, _MATRIX)
-    holds_matrix = isinstance(matrix, list) or (isinstance(matrix, dict) and "data" in matrix)
+    listed = isinstance(matrix, list) and not any(isinstance(one, dict) for one in matrix)
+    holds_matrix = listed or (isinstance(matrix, dict) and "data" in matrix)
     return holds_matrix or any(key in part for key in (*_FX, *_CX))
 
 
@@ -399,7 +414,10 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
     found = said[0] or said[1]
     if not found and "scale" in own and "fx" in own:  # as mappers of rooms write it
         found = {"depth_scale": own["scale"]}
-    scales = {key: _units_per_meter(path, key, value) for key, value in found.items()}
+    millimeters = _BOP in own  # are what it multiplies raw depths to
+    scales = {
+        key: _units_per_meter(path, f"{key}_in_mm" if millimeters else key, value) for key, value in found.items()
+    }
     if scales and max(scales.values()) > 1.001 * min(scales.values()):
         raise DataError(
             f"{path}: {' and '.join(scales)} give different depth scales ({', '.join(f'{v:g}' for v in scales.values())} raw"

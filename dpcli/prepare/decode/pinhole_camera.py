@@ -134,13 +134,17 @@ def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndar
 
 @dataclass(frozen=True)
 class Calibration:
-    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
+    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter.
+
+    chosen: what the camera is called where the file holds others, too.
+    """
 
     intrinsics: Intrinsics
     width: int = 0
     height: int = 0
     depth_scale: float | None = None
     source: str = "the options"
+    chosen: str = ""
 
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
@@ -194,4 +198,5 @@ class Calibration:
         declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
         declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
         declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []
+        lines = [f"{self.source}: of its cameras the one called {self.chosen} is taken"] if self.chosen else []
+        return lines + ([f"{self.source}: declares {', '.join(declared)}"] if declared else [])

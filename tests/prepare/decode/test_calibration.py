@@ -84,6 +84,20 @@ FORMS = [
     ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
     ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
     ("k.json", {**{k: str(v) for k, v in PLAIN.items()}, "width": "640", "height": "480"}, (640, 480)),
+    (
+        "k.json",
+        {
+            "parameters": [{"extrinsic": [1], "intrinsic": {"width": 640, "height": 480, "intrinsic_matrix": COLUMNS}}]
+            * 2
+        },
+        (640, 480),
+    ),
+    (
+        "k.json",
+        {"cameraData": [[0, {"intrinsicMatrix": NESTED, "width": 640, "height": 480, "distortionCoeff": [0] * 14}]]},
+        (640, 480),
+    ),
+    ("k.json", {str(t): {"cam_K": ROWS, "cam_t_w2c": [t]} for t in range(3)}, (0, 0)),
     ("k.yaml", ROS, (640, 480)),
     ("k.yml", OPENCV, (640, 480)),
     ("k.yaml", KALIBR, (640, 480)),
@@ -123,6 +137,7 @@ def test_matrices_of_numpy_and_opencv(tmp_path):
         ("depth_scale", 4000.0, 4000),
         ("depth_scale", 0.00025, 4000),
         ("depth_units", 0.001, 1000),
+        ("depth_scale_in_mm", 0.1, 10000),
         ("scale", 6553.5, 6553.5),
         ("depth_unit", "mm", 1000),
         ("depthScaleFactor", 10000, 10000),
@@ -247,6 +262,16 @@ def test_a_calibration_of_larger_pictures_is_scaled(factor, width, height):
     small = large.of_pictures(width, height)
     assert small.fx == pytest.approx(50) and small.fy == pytest.approx(60)
     assert small.cx == pytest.approx(width / 2 - 0.5) and small.cy == pytest.approx(1.5 / factor - 0.5)
+
+
+def test_a_scene_of_bop_multiplies_raw_depths_to_millimeters(tmp_path):
+    frames = {str(t): {"cam_K": ROWS, "depth_scale": 0.1} for t in range(2)}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(frames))
+    assert read_calibration(tmp_path / "scene_camera.json").depth_scale == 10_000
+    frames["1"] = {"cam_K": [700.0, *ROWS[1:]], "depth_scale": 0.1}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(frames))
+    with pytest.raises(DataError, match=r"holds several cameras \(0, 1\)"):
+        read_calibration(tmp_path / "scene_camera.json")
 
 
 def test_another_shape_and_a_center_outside_are_refused(tmp_path):
