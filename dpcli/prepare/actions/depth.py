@@ -37,7 +37,7 @@ from dpcli.prepare.decode.depth_files import (
     tells_times,
 )
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, without_rays
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
+BLIND = "pixels with a depth that no ray reaches through the lens of the calibration (of another camera?) dropped"
 _FARTHEST = 300.0  # meters
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
@@ -212,7 +213,9 @@ class DepthVideos:
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
-        depth, unit = self._inverted(depth, item.path), 1 / scale
+        depth, blind = without_rays(self._inverted(depth, item.path), camera)
+        notes |= {BLIND: blind} if blind else {}
+        unit = 1 / scale
         seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0

@@ -24,7 +24,7 @@ from dpcli.prepare.decode.calibration_texts import (
     without_matlab_counting,
 )
 from dpcli.prepare.decode.lenses import MODEL, are_numbers, first, is_lens, lens_of_mapping, letters, require_pinhole
-from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, KinectCalibration, LensIntrinsics
 from dpcli.store.schema import METERS
 from dpcli.text_files import check_depth, decode_text, parse_json
 
@@ -53,6 +53,7 @@ _COLMAP = {
     "OPENCV": 8,
     "FULL_OPENCV": 12,
 }  # how many parameters
+_KINECT_SENSOR = 1024  # pixels of a side
 _DEEPEST = 6  # entries within one another
 _FEWEST_TERMS = 4  # of a lens
 _MOST_NUMBERS = 64  # in an array
@@ -274,10 +275,7 @@ def _of_colmap(path: Path, cameras: list[list[str]]) -> Calibration:
 
 def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
     if "CalibrationInformation" in data:
-        raise DataError(
-            f"{path}: is the raw calibration of an Azure Kinect, whose lens model is not read; {_EXPECTED}, as the"
-            " camera's SDK reports them for the depth mode"
-        )
+        return kinect_calibration(path, data["CalibrationInformation"])
     data = without_matlab_counting(_with_numbers(data))
     chosen, own = _camera_of(path, data)
     if are_numbers([own.get("skew", 0)]) and own.get("skew"):
@@ -291,6 +289,33 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
         numbers[2:], size = [numbers[2] - cut[0], numbers[3] - cut[1]], _pixel_counts(path, *cut[2:])
     scale = _depth_scale(path, own, data)
     return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path), chosen)
+
+
+def kinect_calibration(path: Path, told: Any) -> Calibration:
+    """Returns the depth camera of an Azure Kinect from the raw calibration that its SDK attaches to recordings: shares of the
+    sensor from its corner, and a rational lens whose p2 stands before p1. Raises DataError where it holds none.
+    """
+    cameras = told.get("Cameras") if isinstance(told, dict) else None
+    cameras = [one for one in cameras if isinstance(one, dict)] if isinstance(cameras, list) else []
+    depth = next((one for one in cameras if one.get("Location") == "CALIBRATION_CameraLocationD0"), {})
+    lens = depth.get("Intrinsics") if isinstance(depth.get("Intrinsics"), dict) else {}
+    shares, side = lens.get("ModelParameters"), _KINECT_SENSOR
+    known = isinstance(shares, list) and len(shares) >= 14 and are_numbers(shares) and not any(shares[10:12])
+    sizes = (depth.get("SensorWidth"), depth.get("SensorHeight"))
+    if not known or sizes != (side, side) or not str(lens.get("ModelType")).endswith("ModelBrownConrady"):
+        raise DataError(
+            f"{path}: is the raw calibration of an Azure Kinect without a depth camera of {side}x{side} and model BrownConrady;"
+            f" {_EXPECTED}, as the camera's SDK reports them for the depth mode"
+        )
+    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = shares[:14]
+    numbers = [fx * side, fy * side, cx * side - 0.5, cy * side - 0.5]
+    return KinectCalibration(_intrinsics(path, numbers, (k1, k2, p1, p2, k3, k4, k5, k6)), side, side, source=str(path))
+
+
+def attached_calibration(path: Path, text: bytes) -> Calibration:
+    """Returns the camera of a calibration in JSON that is attached to a video. Raises DataError where it can't be used."""
+    source = path / "calibration.json"
+    return _of_mapping(source, _parsed(source, text.decode("utf-8", "replace").rstrip("\0")))
 
 
 def _camera_of(path: Path, data: dict[str, Any]) -> tuple[str, dict[str, Any]]:
