@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from fnmatch import fnmatchcase
 from os.path import splitext
 from pathlib import Path
@@ -52,7 +53,7 @@ class TimesBeside:
 class Series:
     """Holds the files of one series in their order; ``left_out`` names what else lay there, a phrase each.
 
-    ``beside``: times that a file beside the frames lists.
+    ``beside``: times that a file beside the frames lists. ``joined``: the series that a user's pattern makes one of, a phrase each.
     """
 
     folder: Path
@@ -62,6 +63,7 @@ class Series:
     numbered: bool = True
     suffix: str = field(default="", compare=False)
     beside: TimesBeside | None = field(default=None, compare=False)
+    joined: tuple[str, ...] = ()
 
     @property
     def paths(self) -> list[Path]:
@@ -155,6 +157,8 @@ def _doubts_of_order(series: Series) -> str:
     """Returns what may be wrong with the order of frames: names that count nothing, or that hold two counts; "" if nothing."""
     if len(series.names) < 2 or _counted_in_hex(series.names):
         return ""
+    if series.joined:
+        return f"the pattern joins {len(series.joined)} series in the order of their names: {first_names(series.joined, _LISTED)}"
     if not series.numbered:
         return f"no number counts its frames; they are in the order of their names: {', '.join(series.names[:3])} ..."
     names = parse_names(series.names)
@@ -242,11 +246,14 @@ def _spelled_apart(group: list[Name]) -> list[list[Name]]:
 
 def _by_outer_numbers(group: list[Name]) -> tuple[list[list[Name]], int, bool] | None:
     """Returns the files of one shape by all of their varying numbers but one, that one's place, and whether it tells times;
-    None where one number varies, or several tell times. The number left out is the one that tells times, else the last.
+    None where one number varies, or several tell times. The number left out is the one that tells times, else the last; of two
+    that tell times the one that is another in every name, beside when its recording began.
     """
     columns = NumberColumns(group)
     varying = columns.varying()
     timed = [column for column in varying if columns.tells_times(column)]
+    if len(timed) > 1:
+        timed = [column for column in timed if len(set(columns.columns[column])) == len(group)]
     if len(varying) < 2 or len(timed) > 1:
         return None
     inner = timed[0] if timed else varying[-1]
@@ -269,12 +276,20 @@ def _objects(group: list[Name]) -> list[list[Name]]:
     if timed:
         apart = [k for k in range(len(group[0].numbers)) if k != inner and len({name.numbers[k] for name in group}) > 1]
         fractions = all(len(name.numbers[k]) in (6, 9) for name in group for k in apart)  # of the seconds
-        return parts if several and not fractions else [group]
+        return parts if several and not fractions and not _within_seconds(parts, inner, apart) else [group]
     anew = all(own == [counts[0][0] + k for k in range(len(own))] for own in counts)
     alike = all(own == counts[0] for own in counts) and counts[0][-1] >= _SIXTY
     ends = sorted((own[0], own[-1]) for own in counts)
     overlap = any(after[0] <= before[1] for before, after in zip(ends, ends[1:])) and not _are_clocks(group)
     return parts if several and (anew or alike or overlap) else [group]
+
+
+def _within_seconds(parts: list[list[Name]], inner: int, apart: list[int]) -> bool:
+    """Returns whether another number than the one at ``inner`` tells times, too, and is that of the second of each frame."""
+    if not any(NumberColumns([name for part in parts for name in part]).tells_times(k) for k in apart):
+        return False
+    times = [NumberColumns(part).seconds(inner) or [Decimal(0)] for part in parts]
+    return all(max(own) - min(own) <= 1 for own in times)
 
 
 def _are_clocks(group: list[Name]) -> bool:
@@ -381,7 +396,12 @@ def _by_pattern(folder: Path, names: list[str], pattern: str) -> Series | None:
     found = all_series(folder, matching)
     others = all_series(folder, [name for name in names if not fnmatchcase(name, pattern)])
     one = found[0] if len(found) == 1 else _joined(found, pattern)
-    return replace(one, left_out=tuple(other.described() for other in others))
+    longer = tuple(own.described() for own in found if len(own.names) > 1)
+    return replace(
+        one,
+        left_out=tuple(other.described() for other in others),
+        joined=longer if len(longer) == len(found) > 1 else (),
+    )
 
 
 def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:

@@ -56,6 +56,12 @@ def test_what_belongs_to_a_clip(names, frames, left_out):
         ],
         ["1700000000000_1.bin", "1700000000100_1.bin", "1700000000000_2.bin", "1700000000090_2.bin"],
         ["left-3.bin", "left-4.bin", "right-3.bin", "right-4.bin", "right-5.bin"],
+        [  # of nuScenes: when the log began, and when the frame was taken
+            "n008-2018-08-01-15-16-36-0400__LIDAR_TOP__1533151603547590.pcd.bin",
+            "n008-2018-08-01-15-16-36-0400__LIDAR_TOP__1533151606547590.pcd.bin",
+            "n008-2018-08-28-16-43-51-0400__LIDAR_TOP__1535489296047917.pcd.bin",
+            "n008-2018-08-28-16-43-51-0400__LIDAR_TOP__1535489299047917.pcd.bin",
+        ],
     ],
 )
 def test_several_clips_in_a_folder_are_listed_and_one_can_be_named(names):
@@ -69,6 +75,15 @@ def test_several_clips_in_a_folder_are_listed_and_one_can_be_named(names):
 
 def test_a_pattern_may_join_what_no_rule_would():
     assert len(chosen("cup_0.ply", "bowl_0.ply", "README.txt", pattern="*.ply").names) == 2
+
+
+def test_a_pattern_that_fits_several_series_is_told():
+    series = chosen(
+        *(f"{thing}_{k}.ply" for thing in ("cup", "bowl") for k in range(3)), "door_0.ply", pattern="*[lp]_*"
+    )
+    assert series.joined == ("bowl_*.ply (3 files)", "cup_*.ply (3 files)") and series.left_out == ("door_0.ply",)
+    told = "v: the pattern joins 2 series in the order of their names: bowl_*.ply (3 files), cup_*.ply (3 files)"
+    assert told in about_series([("v", series)])
 
 
 def test_nothing_but_texts_about_frames_is_no_clip():
@@ -98,6 +113,7 @@ def test_nothing_but_texts_about_frames_is_no_clip():
         (["1403636579763555584.png", "1403636579813555456.png"], [0, 0.049999872]),
         (["1700000000_5000000.png", "1700000000_50000000.png", "1700000000_105000000.png"], [0, 0.045, 0.1]),
         (["1700000000000.bin", "1700000000100.bin"], [0, 0.1]),
+        ([f"20240101_10000{k // 2}_{1704103200000 + 400 * k}.bin" for k in range(4)], [0, 0.4, 0.8, 1.2]),
         (["7_1305031102.175304.png", "8_1305031102.211214.png"], [0, 0.03591]),
         (["1305031102.9.pcd", "1305031102.50.pcd", "1305031102.500000000.pcd"], [0, 41e-9, 0.499999991]),
         (["12.345000.pcd", "12.400000.pcd"], [0, 0.055]),

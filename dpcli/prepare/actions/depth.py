@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +17,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
+    doubts_of_place,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -37,7 +37,7 @@ from dpcli.prepare.decode.depth_files import (
     tells_times,
 )
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, without_rays
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Reader, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 CUT = "videos that end before their container does (truncated: frames may be lost)"
+BLIND = "pixels with a depth that no ray reaches through the lens of the calibration (of another camera?) dropped"
 _FARTHEST = 300.0  # meters
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
@@ -58,6 +59,7 @@ _OTHER_PICTURES = re.compile(
     r"|(?<![a-z])(n?ir|lwir|ab|gray|grey|mono)(?![a-z])",
     re.IGNORECASE,
 )
+_ALIGNED = re.compile(r"align|regist|depth_?(2|to)_?(colou?r|rgb)", re.IGNORECASE)
 _CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz")  # points, not pictures
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".gif .ts .mts .wmv .flv .mpg .pam .ppm .bmp .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo"
@@ -134,7 +136,7 @@ class DepthVideos(Reader):
         values = {k: v for k, v in asdict(self).items() if k not in apart}
         given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern, "topic": self.topic}
         if self.calibration:
-            given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k != "source"}
+            given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k not in ("source", "chosen")}
         return {**values, "far": self.far if np.isfinite(self.far) else None, **{k: v for k, v in given.items() if v}}
 
     @property
@@ -188,15 +190,26 @@ class DepthVideos(Reader):
         series: Series | None = item.extra["series"]
         name = f"{item.name} {series.pattern if series else ''}"
         require_depth(item.path, name)
+        if self.calibration and self.calibration.chosen and _ALIGNED.search(name):
+            raise DataError(
+                f"{item.path}: by its name its depth was aligned to the color camera, but of the cameras in"
+                f" {self.calibration.source} the one called {self.calibration.chosen} is taken; expected --intrinsics of the color"
+                " camera: save it as a file of its own"
+            )
         video = self._video(item)
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
-        notes |= doubts_of_name(name) | video.notes | ({} if told else doubts_of_units(depth))
+        notes |= (
+            doubts_of_name(name)
+            | video.notes
+            | ({} if told else doubts_of_units(depth) or doubts_of_place(item.path, depth))
+        )
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing)}
-        depth, unit = self._inverted(depth, item.path), 1 / scale
+        depth, notes[BLIND] = without_rays(self._inverted(depth, item.path), camera)
+        unit = 1 / scale
         seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
@@ -206,7 +219,7 @@ class DepthVideos(Reader):
         if not counts.any() and (seen > 0).any():
             raise DataError(f"{item.path}: {self._nothing_left(seen[seen > 0] / scale)}")
         require_plausible(str(item.path), points[:, 2], scale, asked=told)
-        if item.extra["recording"] and not (video.camera or self.calibration or self.intrinsics or self.fov):
+        if item.extra["recording"] and not (video.camera or self._given_camera):
             notes[f"recordings without camera_info of their depth, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return sample_of_frames(item, points, counts, notes, time=self._times(item, video))
 
@@ -223,7 +236,9 @@ class DepthVideos(Reader):
             return read_depth_video(item.path, self.stride, item.extra["series"])
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
-        read, camera, scale = read_recorded_depth(item.path, self.topic, self.stride)
+        read, camera, scale = read_recorded_depth(
+            item.path, self.topic, self.stride, with_camera=not self._given_camera
+        )
         scale = None if read.frames[0].dtype.kind == "f" else scale  # these are meters
         return DepthVideo(np.stack(read.frames), read.time, notes=read.notes, scale=scale, camera=camera)
 
@@ -242,6 +257,10 @@ class DepthVideos(Reader):
             )
             raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
         return video.time
+
+    @property
+    def _given_camera(self) -> bool:
+        return bool(self.intrinsics or self.calibration or self.fov)
 
     @property
     def _declared_scale(self) -> float | None:
@@ -275,7 +294,7 @@ class DepthVideos(Reader):
 
     def _camera(self, width: int, height: int, recorded: Calibration | None) -> Intrinsics:
         """Returns the user's camera, or the one that a recording describes, or one of a usual field of view."""
-        calibration = self.calibration or (None if self.intrinsics or self.fov else recorded)
+        calibration = self.calibration or (None if self._given_camera else recorded)
         if calibration:
             return calibration.of_pictures(width, height)
         return self.intrinsics or Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
@@ -288,8 +307,7 @@ class DepthVideos(Reader):
             lines.append(f"not read: {first_names(unread)}")
         if left_out := self._chosen[1]:
             lines.append(f"left out, by their names beside depth: {first_names(left_out)}")
-        unknown = not (self.intrinsics or self.calibration or self.fov)
-        if unknown and not all(item.extra["recording"] for item in items):
+        if not self._given_camera and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
                 " where a file tells none"
@@ -333,12 +351,13 @@ def pictures_beside_depth(videos: Mapping[Path, Series | None]) -> set[Path]:
     return {
         path
         for path, series in videos.items()
-        if any(
-            part.parent in with_depth and _OTHER_PICTURES.search(part.stem) and not says_depth(part.stem)
-            for part in (path, *path.parents)
-        )
+        if any(part.parent in with_depth and _says_other(part.stem) for part in (path, *path.parents))
         or (series and not says_depth(path.stem) and len(series.names) > 1 and (path.parent, series.stems) in frames)
     }
+
+
+def _says_other(name: str) -> bool:
+    return _OTHER_PICTURES.search(name) is not None and not says_depth(name)
 
 
 def _not_read(root: Path, clips: Collection[Path]) -> list[str]:
@@ -373,11 +392,19 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     clips = {os.fspath(recording) for recording, _ in found}
     # frames are many: they are neither sorted nor asked what they are
     for folder, folders, files in walk_folders(path):
+        depth_beside = any(says_depth(name) for name in folders)
         for name in folders:
-            with suppress(PermissionError):  # it is told as skipped
-                if series := frame_series(Path(folder, name), pattern):
-                    found.append((Path(folder, name), with_times(series, path)))
+            own = Path(folder, name)
+            try:
+                if series := frame_series(own, pattern):
+                    found.append((own, with_times(series, path)))
                     clips.add(os.path.join(folder, name))
+            except PermissionError:  # it is told as skipped
+                pass
+            except DataError:  # nobody has to choose among the masks of each object beside depth
+                if not (depth_beside and _says_other(name)):
+                    raise
+                found.append((own, None))
         if folder in clips:
             files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))

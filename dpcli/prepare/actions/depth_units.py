@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from dpcli.errors import DataError
@@ -23,6 +25,9 @@ _WIDE, _SPARSE = (3, 0.5)
 LIKE_KITTI = (
     "videos of wide pictures with few depths; if they are KITTI's, 256 units are a meter: give --depth-scale 256"
 )
+_OF_TUM = ("depth.txt", "associations.txt", "association.txt", "associate.txt", "associated.txt")
+_FAR_INDOORS = 4000  # raw units: four meters of millimeters, or the desk of a data set like TUM's
+LIKE_TUM = "videos beside {}, a list as TUM's data sets have it; if they are of their kind, 5000 units are a meter: give --depth-scale 5000"
 UP_TO_ONE = (
     "videos of depths that end at exactly 1, as a depth buffer's or those divided by the largest do; taken for meters"
     " (--depth-scale, --far)"
@@ -109,6 +114,15 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
             what = f"videos whose raw depths go in steps of {step}"
             return {f"{what}; if their sensor counted millimeters, give --depth-scale {scale}": 1}
     return {}
+
+
+def doubts_of_place(path: Path, frames: np.ndarray) -> dict[str, int]:
+    """Returns a note when far raw depths (T,H,W) of 16 bits lie in a folder beside the lists of TUM's data sets, ICL-NUIM's or Bonn's."""
+    some = _some_depths(frames)
+    if frames.dtype.itemsize != 2 or not len(some) or float(median(some)) < _FAR_INDOORS:
+        return {}
+    beside = next((name for name in _OF_TUM if (path.parent / name).is_file()), "")
+    return {LIKE_TUM.format(beside): 1} if beside else {}
 
 
 def doubts_of_marks(frames: np.ndarray) -> dict[str, int]:

@@ -25,7 +25,8 @@ from dpcli.prepare.decode.calibration_texts import (
     numbers_in,
     without_matlab_counting,
 )
-from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.lenses import MODEL, are_numbers, first, is_lens, lens_of_mapping, letters, require_pinhole
+from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, KinectCalibration, LensIntrinsics
 from dpcli.store.schema import METERS
 from dpcli.text_files import check_depth, decode_text, parse_json
 
@@ -33,7 +34,7 @@ _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
 _CX = ("cx", "ppx", "c_x", "mx_depth")
 _CY = ("cy", "ppy", "c_y", "my_depth")
 _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
-_MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
+_MATRIX += ("m_calibrationdepthintrinsic", _BOP := "cam_k")  # of ScanNet's recordings, and of BOP's scenes
 _SIZE_OF = (
     "^(m|camera|cam|sensor)?(depth|ir|image|img|picture|frame|resolution|{})*"  # and before the names of both sides
 )
@@ -44,14 +45,6 @@ _SCALE = re.compile(  # a key of the depth scale without what is no letter, and 
     r"(?:m|png|raw|integer|sensor|camera)?depth(?:map|image|raw|pixel)?(?:scal(?:e|ing)|units?|factor|shift|to(?=m))+"
     r"(per|in|to)?(mm|millimet(?:er|re)s?|cm|um|m|met(?:er|re)s?)?"
 )
-_LENS = re.compile(  # a key of a lens's coefficients without what is no letter
-    r"d|kc|coeff(?:icient)?s|disto|(?:cam(?:era)?|lens|depth|ir)*dist(?:ort(?:ion)?)?"
-    r"(?:coe?ff?(?:icient)?|param(?:eter)?|vec(?:tor)?|mat(?:rix)?|model)?s?"
-)
-_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenCV's order
-_MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
-_BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "pinhole", "none")
-_BROWN += ("radtan", "radial_tangential")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
 _ABOUT_CAMERAS = "projection|dist(?:ortions?)?|intrinsics?|coefficients?|coeffs?|params?|parameters?|camera|cam|matrix"
 _COLMAP = {
@@ -62,6 +55,9 @@ _COLMAP = {
     "OPENCV": 8,
     "FULL_OPENCV": 12,
 }  # how many parameters
+_KINECT_SENSOR = 1024  # pixels of a side
+_DEEPEST = 6  # entries within one another
+_FEWEST_TERMS = 4  # of a lens
 _MOST_NUMBERS = 64  # in an array
 _MOST_PIXELS = 1_000_000  # of a side of a picture
 _EXPECTED = (
@@ -109,9 +105,9 @@ def camera_of_arrays(
     told = {k.lower(): v.item() if v.size == 1 else v.tolist() for k, v in small.items() if v.dtype.kind in "uifU"}
     camera = _of_mapping(path, told) if _holds_camera(told) else None
     scale = camera.depth_scale if camera else _depth_scale(path, told, {})
-    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *_MODEL, "width", "height") if camera else ()
+    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *MODEL, "width", "height") if camera else ()
     unread = (k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
-    return camera, scale, tuple(k for k in unread if not (camera and _LENS.fullmatch(_letters(k.lower()))))
+    return camera, scale, tuple(k for k in unread if not (camera and is_lens(k.lower())))
 
 
 def camera_of_any(
@@ -179,7 +175,7 @@ def _yaml(path: Path, text: str) -> Any:
 def _number_or_text(text: str) -> Any:
     """Returns the number that a text holds, the list of its numbers where it holds four or more, else the text itself."""
     numbers = numbers_in(text.rstrip("; ").replace(",", " ")) or ()
-    return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= len(_TERMS[:4]) else text
+    return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= _FEWEST_TERMS else text
 
 
 def _with_numbers(data: Any) -> Any:
@@ -274,42 +270,77 @@ def _of_colmap(path: Path, cameras: list[list[str]]) -> Calibration:
 
 def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
     if "CalibrationInformation" in data:
-        raise DataError(
-            f"{path}: is the raw calibration of an Azure Kinect, whose lens model is not read; {_EXPECTED}, as the"
-            " camera's SDK reports them for the depth mode"
-        )
+        return kinect_calibration(path, data["CalibrationInformation"])
     data = without_matlab_counting(_with_numbers(data))
-    own = _camera_of(path, data)
-    if _are_numbers([own.get("skew", 0)]) and own.get("skew"):
+    chosen, own = _camera_of(path, data)
+    if are_numbers([own.get("skew", 0)]) and own.get("skew"):
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
+    lens = lens_of_mapping(path, own)
     numbers = _pixels(path, own)
-    lens = _lens(path, own)
     size = _resolution(path, own, numbers[2:])
     roi = own.get("roi")  # of ROS: what is cut out of the picture that the numbers are for; none where its size is 0
     cut = [roi.get(key) for key in ("x_offset", "y_offset", "width", "height")] if isinstance(roi, dict) else []
-    if cut and _are_numbers(cut) and all(cut[2:]):
+    if cut and are_numbers(cut) and all(cut[2:]):
         numbers[2:], size = [numbers[2] - cut[0], numbers[3] - cut[1]], _pixel_counts(path, *cut[2:])
     scale = _depth_scale(path, own, data)
-    return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
+    return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path), chosen)
 
 
-def _camera_of(path: Path, data: dict[str, Any]) -> dict[str, Any]:
-    """Returns the mapping that holds intrinsics, in small letters: the whole, or the part of the depth camera."""
+def kinect_calibration(path: Path, told: Any) -> Calibration:
+    """Returns the depth camera of an Azure Kinect from the raw calibration that its SDK attaches to recordings: shares of the
+    sensor from its corner, and a rational lens whose p2 stands before p1. Raises DataError where it holds none.
+    """
+    cameras = told.get("Cameras") if isinstance(told, dict) else None
+    cameras = [one for one in cameras if isinstance(one, dict)] if isinstance(cameras, list) else []
+    depth = next((one for one in cameras if one.get("Location") == "CALIBRATION_CameraLocationD0"), {})
+    lens = depth.get("Intrinsics") if isinstance(depth.get("Intrinsics"), dict) else {}
+    shares, side = lens.get("ModelParameters"), _KINECT_SENSOR
+    known = isinstance(shares, list) and len(shares) >= 14 and are_numbers(shares) and not any(shares[10:12])
+    sizes = (depth.get("SensorWidth"), depth.get("SensorHeight"))
+    if not known or sizes != (side, side) or not str(lens.get("ModelType")).endswith("ModelBrownConrady"):
+        raise DataError(
+            f"{path}: is the raw calibration of an Azure Kinect without a depth camera of {side}x{side} and model BrownConrady;"
+            f" {_EXPECTED}, as the camera's SDK reports them for the depth mode"
+        )
+    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = shares[:14]
+    numbers = [fx * side, fy * side, cx * side - 0.5, cy * side - 0.5]
+    return KinectCalibration(_intrinsics(path, numbers, (k1, k2, p1, p2, k3, k4, k5, k6)), side, side, source=str(path))
+
+
+def attached_calibration(path: Path, text: bytes) -> Calibration:
+    """Returns the camera of a calibration in JSON that is attached to a video. Raises DataError where it can't be used."""
+    source = path / "calibration.json"
+    return _of_mapping(source, _parsed(source, text.decode("utf-8", "replace").rstrip("\0")))
+
+
+def _camera_of(path: Path, data: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Returns the mapping that holds intrinsics, in small letters: the whole, the only one, one of several that are equal, or the
+    part of the depth camera; before it its name where others differ.
+    """
     found = list(_cameras("", data, {}))
-    depth = [part for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
-    if len(found) == 1 or (found and found[0][0] == ""):
-        return found[0][1]
-    if len(depth) == 1:
-        return depth[0]
     if not found:
+        require_pinhole(path, {str(key).lower(): value for key, value in data.items()})
         raise DataError(f"{path}: {_EXPECTED}")
+    if len(found) == 1 or found[0][0] == "":
+        return "", found[0][1]
+    depth = [(name, part) for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
+    alike = depth or found
+    if all(_same_camera(path, part, alike[0][1]) for _, part in alike[1:]):
+        return ("" if len(alike) == len(found) else alike[0][0]), alike[0][1]
     names = ", ".join(name for name, _ in found[:5])
     raise DataError(f"{path}: holds several cameras ({names}); expected one, or one called depth")
 
 
+def _same_camera(path: Path, part: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Returns whether two mappings hold one camera, as where a file repeats it for every frame."""
+    return part == other or all(read(path, part) == read(path, other) for read in (_pixels, lens_of_mapping))
+
+
 def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yields every mapping that holds intrinsics, with what is said around it, such as the size of the pictures."""
-    if isinstance(data, dict) and depth < 5:
+    if depth == _DEEPEST:
+        return
+    if isinstance(data, dict):
         own = lower_keys(data)
         around = {**outer, **{key: value for key, value in own.items() if not isinstance(value, dict)}}
         if _holds_camera(own):
@@ -318,6 +349,9 @@ def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Ite
             beside = [other for said, other in data.items() if _is_lens_of(str(said), str(key))]
             lens = {"distortion": beside[0]} if beside else {}
             yield from _cameras(f"{name}/{key}".lstrip("/"), value, {**around, **lens}, depth + 1)
+    elif isinstance(data, list):
+        for place, value in enumerate(data):
+            yield from _cameras(f"{name}/{place}", value, outer, depth + 1)
 
 
 def _is_lens_of(key: str, camera: str) -> bool:
@@ -329,39 +363,29 @@ def _is_lens_of(key: str, camera: str) -> bool:
 
 
 def _holds_camera(part: dict[str, Any]) -> bool:
-    matrix = _first(part, _MATRIX)
-    holds_matrix = isinstance(matrix, list) or (isinstance(matrix, dict) and "data" in matrix)
+    matrix = first(part, _MATRIX)
+    listed = isinstance(matrix, list) and not any(isinstance(one, dict) for one in matrix)
+    holds_matrix = listed or (isinstance(matrix, dict) and "data" in matrix)
     return holds_matrix or any(key in part for key in (*_FX, *_CX))
 
 
-def _first(part: dict[str, Any], names: tuple[str, ...]) -> Any:
-    return next((part[name] for name in names if part.get(name) is not None), None)
-
-
 def _pixels(path: Path, own: dict[str, Any]) -> list[float]:
-    matrix = _first(own, _MATRIX)
+    matrix = first(own, _MATRIX)
     if isinstance(matrix, dict):
         matrix = matrix.get("data")
     if isinstance(matrix, list):
-        return [float(v) for v in matrix] if len(matrix) == 4 and _are_numbers(matrix) else _of_matrix(path, matrix)
-    values = [_first(own, names) for names in (_FX, _FY, _CX, _CY)]
-    if not _are_numbers(values):
+        return [float(v) for v in matrix] if len(matrix) == 4 and are_numbers(matrix) else _of_matrix(path, matrix)
+    values = [first(own, names) for names in (_FX, _FY, _CX, _CY)]
+    if not are_numbers(values):
         raise DataError(f"{path}: {_EXPECTED}")
     return [float(value) for value in values]
-
-
-def _are_numbers(values: list[Any]) -> bool:
-    """Returns whether all values are numbers that a camera may have: neither NaN, infinite nor astronomical."""
-    return all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e15 for value in values
-    )
 
 
 def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[int, int]:
     """Returns width and height of the pictures, 0 where nothing tells them. Two numbers of one entry stand in the order that
     puts the principal point ``center`` nearer to the middle.
     """
-    size = next((value for key, value in own.items() if _SIZE.match(_letters(key))), None)
+    size = next((value for key, value in own.items() if _SIZE.match(letters(key))), None)
     if isinstance(size, dict) and "data" in size:  # OpenCV's lists
         size = size["data"]
     if isinstance(size, dict):
@@ -369,7 +393,7 @@ def _resolution(path: Path, own: dict[str, Any], center: list[float]) -> tuple[i
     if isinstance(size, str):
         size = [float(number) for number in re.findall(r"\d+", size)]
     pair = size if isinstance(size, list) and len(size) == 2 else _sides(own)
-    if not _are_numbers(pair) or any(value <= 0 for value in pair):
+    if not are_numbers(pair) or any(value <= 0 for value in pair):
         return 0, 0
     turned = size is pair and _off_middle(center, pair[::-1]) < _off_middle(center, pair)
     return _pixel_counts(path, *(pair[::-1] if turned else pair))
@@ -381,15 +405,11 @@ def _sides(own: dict[str, Any]) -> list[Any]:
         found = []
         for side in _SIDES:
             known = re.compile(_SIZE_OF.format(other) + side)
-            keys = sorted((key for key in own if known.match(_letters(key)) and own[key] is not None), key=len)
+            keys = sorted((key for key in own if known.match(letters(key)) and own[key] is not None), key=len)
             found.append(own[keys[0]] if keys else None)
         if None not in found:
             return found
     return [None, None]
-
-
-def _letters(key: str) -> str:
-    return re.sub("[^a-z]", "", key)
 
 
 def _off_middle(center: list[float], size: list[float]) -> float:
@@ -404,60 +424,6 @@ def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
-    """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
-    values = _coefficients(own)
-    told = own.get("distortion")  # as RealSense's tools print it, or what stands beside the coefficients
-    told = _first(lower_keys(told), _MODEL) if isinstance(told, dict) else told
-    if isinstance(values, dict):
-        listed = values.get("data", _coefficients(lower_keys(values)))
-        values = _named_terms(path, values) if listed is None else listed
-    if values is None and any(key in own for key in _TERMS):
-        values = _named_terms(path, {key: own[key] for key in _TERMS if key in own})
-    if values is None and (radial := own.get("radial_distortion", own.get("radialdistortion"))) is not None:
-        bent = own.get("tangential_distortion", own.get("tangentialdistortion")) or [0.0, 0.0]
-        values = [*radial[:2], *bent, *radial[2:]] if isinstance(radial, list) and isinstance(bent, list) else None
-    flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
-    if not _are_numbers(flat):
-        raise DataError(f"{path}: its lens has the coefficients {str(flat):.80}; expected numbers")
-    return lens_coefficients(path, str((isinstance(told, str) and told) or _first(own, _MODEL) or ""), flat)
-
-
-def _coefficients(part: dict[str, Any]) -> Any:
-    """Returns the list or mapping of a lens: the last, which stands nearest to the camera, but before all what isn't called
-    ``distortion``, which may hold the model alone.
-    """
-    found = ((key, part[key]) for key in reversed(part) if _LENS.fullmatch(_letters(key)))
-    listed = {key: value for key, value in found if value and isinstance(value, (list, dict))}
-    return listed[min(listed, key="distortion".__eq__)] if listed else None
-
-
-def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
-    """Returns the coefficients of a lens that a mapping names. Raises DataError at one that isn't known."""
-    small = {str(key).lower(): value or 0.0 for key, value in terms.items()}
-    told = {key: value for key, value in small.items() if key not in _TERMS and value}
-    strange = [key for key, value in told.items() if _are_numbers([value]) or isinstance(value, list) and any(value)]
-    if strange:
-        raise DataError(f"{path}: its lens has a coefficient {strange[0]}; expected {', '.join(_TERMS)} alone")
-    return [small.get(key, 0.0) for key in (_TERMS if any(small.get(key) for key in _TERMS[5:]) else _TERMS[:5])]
-
-
-def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, ...]:
-    """Returns the coefficients of a lens, none where all are 0. name: of its model.
-
-    Raises DataError for a model that isn't read.
-    """
-    if not any(flat):
-        return ()
-    model = re.sub("[- ]", "_", name.lower().replace("distortion.", ""))
-    if model not in _BROWN or len(flat) not in (4, 5, 8, 12, 14):
-        raise DataError(
-            f"{path}: its lens is of model {model or 'unknown'} with {len(flat)} coefficients that aren't all 0; expected"
-            " plumb_bob or rational_polynomial (k1 k2 p1 p2 k3 ...), or pictures that were rectified and no coefficients"
-        )
-    return tuple(float(value) for value in flat)
-
-
 def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> float | None:
     """Returns raw units per meter; small values are meters per unit, as RealSense has them.
 
@@ -467,7 +433,10 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
     found = said[0] or said[1]
     if not found and "scale" in own and "fx" in own:  # as mappers of rooms write it
         found = {"depth_scale": own["scale"]}
-    scales = {key: _units_per_meter(path, key, value) for key, value in found.items()}
+    millimeters = _BOP in own  # are what it multiplies raw depths to
+    scales = {
+        key: _units_per_meter(path, f"{key}_in_mm" if millimeters else key, value) for key, value in found.items()
+    }
     if scales and max(scales.values()) > 1.001 * min(scales.values()):
         raise DataError(
             f"{path}: {' and '.join(scales)} give different depth scales ({', '.join(f'{v:g}' for v in scales.values())} raw"
@@ -477,16 +446,16 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
 
 
 def _is_scale(key: str) -> bool:
-    return _SCALE.fullmatch(_letters(key)) is not None
+    return _SCALE.fullmatch(letters(key)) is not None
 
 
 def _units_per_meter(path: Path, key: str, value: Any) -> float:
     """Returns the raw units per meter that a depth scale means. Its key may end with a unit, in which the value is then."""
     if isinstance(value, str) and (unit := unit_of(f"in {value}")):
         return 1 / METERS[unit]
-    if not _are_numbers([value]) or not value > 0:
+    if not are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
-    match = _SCALE.fullmatch(_letters(key))
+    match = _SCALE.fullmatch(letters(key))
     if match and (unit := unit_of(f"in {match[2]}")):
         size = value * METERS[unit] if match[1] != "per" else METERS[unit] / value
         return float(f"{1 / size:.12g}")

@@ -476,7 +476,7 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
         return DepthVideo(np.ascontiguousarray(frames[::stride]), **told)
     if path.suffix.lower() in ARRAY_SUFFIXES:
         return DepthVideo(read_array(path, stride))
-    from dpcli.prepare.decode.video_streams import how_shown
+    from dpcli.prepare.decode.video_streams import attached_json, how_shown
 
     frames, time, missing = read_timed_video(path, stride)
     if not frames:
@@ -487,4 +487,12 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
         JOINED: max(joined_videos(path) - 1, 0),
     }
     notes = {what: count for what, count in told.items() if count}
-    return DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)
+    camera = None
+    if path.suffix.lower() == ".mkv" and (text := attached_json(path)):
+        from dpcli.prepare.decode.calibration import attached_calibration
+
+        try:
+            camera = attached_calibration(path, text)
+        except DataError as error:
+            notes[f"videos whose attached calibration is not used ({error})"] = 1
+    return DepthVideo(np.stack(frames), time, missing, ends_early(path), notes, camera=camera)

@@ -15,7 +15,7 @@ from dpcli.regular_files import why_unreadable
 
 _OF_CAMERAS = (".json", ".txt", ".csv", ".yaml", ".yml", ".xml", ".ini", ".npy", ".pincam")  # suffixes of calibrations
 _CAMERA = re.compile(
-    r"intrinsic|calib|(^|[^a-z])cam(era)?s?[-_ ]?(matri|info|param|intr)|^(k|cameras?)$|(^|[-_.])k$", re.IGNORECASE
+    r"intrinsic|calib|(^|[^a-z])cam(era)?s?[-_ ]?(matri|info|param|intr)|(^|[-_.])(k|cameras?)$", re.IGNORECASE
 )
 _CAMERAS = re.compile(r"intrinsics?$|^cameras?$|^calib", re.IGNORECASE)  # folders of them
 

@@ -14,6 +14,13 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _WIDEST, _LONGEST = 0.1, 1000  # focal lengths in sides of the picture: of 157 degrees, and of what no depth camera has
+_KINECT_MODES = {  # width and height of an Azure Kinect's depth: pixels of its sensor a side, first column and row of what is left
+    (640, 576): (1, 192, 180),
+    (320, 288): (2, 96, 90),
+    (512, 512): (2, 0, 0),
+    (1024, 1024): (1, 0, 0),
+}
+_ARRIVES = 1e-3  # focal lengths by which a ray may miss its pixel
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
 
@@ -66,7 +73,9 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
 
 
 def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Returns where a lens sends rays from, f64 (H,W,2), that arrive at x (W) and y (H): the distortion undone."""
+    """Returns where a lens sends rays from, f64 (H,W,2), that arrive at x (W) and y (H): the distortion undone; NaN where it sends
+    none, as to the corners of a wide lens's pictures, for which OpenCV finds anything.
+    """
     bent = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
     cv2 = load_cv2()
     precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -74,7 +83,18 @@ def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -
         found = cv2.undistortPointsIter(bent, np.eye(3), np.array(distortion), None, None, precise)
     else:
         found = cv2.undistortPoints(bent, np.eye(3), np.array(distortion), criteria=precise)
+    rays = np.concatenate([found, np.ones_like(found[..., :1])], axis=-1)
+    again = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
+    found[~(np.abs(again - bent).max(axis=-1) < _ARRIVES)] = np.nan
     return found.reshape(len(y), len(x), 2)
+
+
+def without_rays(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, int]:
+    """Returns depth (T,H,W) with 0 where the lens sends no ray, and how many pixels had a depth there."""
+    height, width = depth.shape[1:]
+    reached = ~np.isnan(pixel_rays(height, width, intrinsics)[:, 0]).reshape(height, width)
+    count = 0 if reached.all() else int(np.count_nonzero(depth[:, ~reached] > 0))
+    return (np.where(reached, depth, depth.dtype.type(0)) if count else depth), count
 
 
 @lru_cache(maxsize=8)
@@ -134,13 +154,17 @@ def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndar
 
 @dataclass(frozen=True)
 class Calibration:
-    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
+    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter.
+
+    chosen: what the camera is called where the file holds others, too.
+    """
 
     intrinsics: Intrinsics
     width: int = 0
     height: int = 0
     depth_scale: float | None = None
     source: str = "the options"
+    chosen: str = ""
 
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
@@ -194,4 +218,22 @@ class Calibration:
         declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
         declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
         declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []
+        lines = [f"{self.source}: of its cameras the one called {self.chosen} is taken"] if self.chosen else []
+        return lines + ([f"{self.source}: declares {', '.join(declared)}"] if declared else [])
+
+
+class KinectCalibration(Calibration):
+    """Holds the camera of the whole sensor of an Azure Kinect's depth, of which each mode shows another part."""
+
+    def of_pictures(self, width: int, height: int) -> Intrinsics:
+        """Returns the intrinsics of the mode whose pictures have this size. Raises DataError where none has."""
+        mode = _KINECT_MODES.get((width, height))
+        if mode is None:
+            modes = ", ".join(f"{w}x{h}" for w, h in _KINECT_MODES)
+            raise DataError(
+                f"{self.source}: is of an Azure Kinect, whose depth has {modes} pixels, these pictures have {width}x{height}; if"
+                " they were transformed to the color camera or resized, give --fx --fy --cx --cy of the result"
+            )
+        (pixels, left, top), camera = mode, self.intrinsics
+        x, y = ((middle + 0.5) / pixels - 0.5 for middle in (camera.cx, camera.cy))
+        return replace(camera, fx=camera.fx / pixels, fy=camera.fy / pixels, cx=x - left, cy=y - top)

@@ -110,6 +110,18 @@ def how_shown(path: Path, place: int = 0, *, every: bool = False) -> tuple[bool,
     return woven, turned
 
 
+def attached_json(path: Path) -> bytes:
+    """Returns the calibration that an Azure Kinect's recorder attached to a file, nothing where there is none."""
+    import av
+
+    try:
+        with open_container(path) as container:
+            attached = [one.data for one in container.streams.attachments if str(one.name).endswith(".json")]
+    except (av.FFmpegError, OSError, ValueError):
+        return b""
+    return next((data for data in attached if data and b'"CalibrationInformation"' in data), b"")
+
+
 def cuts_left(path: Path) -> bool:
     """Returns whether the codec of a file's first video cuts columns off on the left, in whose place OpenCV stretches what it got."""
     import av

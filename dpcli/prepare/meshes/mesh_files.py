@@ -35,6 +35,9 @@ _ODD_FACE = re.compile(rb"\n[ \t]*f[ \t]+(?!%b(?<=[ \t])%b(?<=[ \t])%b(?:[\r\n#]
 _ODD_LINE = re.compile(rb"(?:\n|\A)(?:[ \t]+[vf][ \t]|[vf]\t|[vf] [^\n#]*#)")
 _COMMA = re.compile(rb"\nv[ \t]+-?\d+,\d")
 _NO_VERTEX = "a face names a vertex that is not there"
+_NOWHERE = (
+    "corners of its faces lie at NaN or infinity, where nothing can be sampled; remove these faces and export it again"
+)
 _BEGINNING = 4096  # bytes of a file that show how it writes numbers
 _STRAIGHT = -1e-6  # of a polygon: a corner that turns inwards by less is what rounding does to a straight edge
 Polygons = tuple[np.ndarray, list[Sequence[int]]]  # points f64 (V,3), and the numbers of each polygon's corners
@@ -59,6 +62,8 @@ def load_mesh(path: Path, root: Path | None) -> Any:
     mesh = _READERS.get(path.suffix.lower(), _by_trimesh)(path, root)
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
         raise ValueError(_NO_VERTEX)
+    if not np.isfinite(np.asarray(mesh.vertices)[mesh.faces]).all():
+        raise ValueError(_NOWHERE)
     return mesh
 
 
@@ -254,7 +259,7 @@ def _mesh_of(polygons: Polygons) -> Any:
 def triangles_of(points: np.ndarray, polygons: Iterable[Sequence[int]]) -> np.ndarray:
     """Returns triangles i64 (T,3) that cover polygons of any outline; points (V,3). Those with two corners cover nothing.
 
-    Raises ValueError where a polygon has a corner that isn't there.
+    Raises ValueError where a polygon has a corner that isn't there, or that lies nowhere.
     """
     from mapbox_earcut import triangulate_float64
 
@@ -262,6 +267,8 @@ def triangles_of(points: np.ndarray, polygons: Iterable[Sequence[int]]) -> np.nd
     for size, corners in _by_size(polygons).items():
         if corners.min() < 0 or corners.max() >= len(points):
             raise ValueError(_NO_VERTEX)
+        if not np.isfinite(points[corners]).all():
+            raise ValueError(_NOWHERE)
         convex = _are_convex(points[corners])
         found += [corners[convex][:, [0, k, k + 1]] for k in range(1, size - 1)]
         for own in corners[~convex]:

@@ -21,11 +21,12 @@ _DISPARITY = re.compile("disp(arity|_?map)?(?![a-z])", re.IGNORECASE)
 
 
 def read_recorded_depth(
-    path: Path, topic: str = "", stride: int = 1
+    path: Path, topic: str = "", stride: int = 1, *, with_camera: bool = True
 ) -> tuple[TopicFrames, Calibration | None, float | None]:
     """Returns the frames, each (H,W) as stored and all alike, the camera or None, and raw units per meter or None.
 
-    topic: of the images, "" for the only one of depth. Raises DataError when there is none or it can't be read.
+    topic: of the images, "" for the only one of depth. with_camera: whether the camera is asked for, which may be of a kind
+    that is refused. Raises DataError when there is none or it can't be read.
     """
     with open_recording(path) as recording:
         name = _depth_topic(recording, topic)
@@ -39,7 +40,7 @@ def read_recorded_depth(
             raise DataError(f"{path}: images of {name} differ in size or type: {found}; expected one kind")
         if read.frames[0].itemsize == 1 and not topic and not _SAYS_DEPTH.search(name):
             raise DataError(f"{path}: {name} holds 8-bit images, hardly depth; if they are, name it with --topic")
-        cameras = _cameras(recording, name)
+        cameras = _cameras(recording, name) if with_camera else []
         read.notes[CHANGES] = int(any(one != cameras[0] for one in cameras))
         return read, cameras[0] if cameras else None, _raw_units(recording, name)
 

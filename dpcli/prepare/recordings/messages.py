@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.cloud_formats.cloud import BEYOND, Cloud, cloud_of_columns
-from dpcli.prepare.decode.calibration import lens_coefficients
+from dpcli.prepare.decode.lenses import lens_coefficients
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, LensIntrinsics
 from dpcli.prepare.decode.png import decode_picture
 from dpcli.prepare.recordings import foxglove

@@ -48,7 +48,7 @@ _EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9), (18, 9))  # digits of a time sinc
 class Name:
     """Holds a file name taken apart: the parts between its numbers (one more than these), and the numbers as written.
 
-    A date with its time of day counts as one number, that of its seconds since 1970.
+    A date with its time of day counts as one number, that of its seconds since 1970; ``spelled`` has it as it stands there.
     """
 
     text: str
@@ -56,6 +56,7 @@ class Name:
     suffix: str
     numbers: tuple[str, ...]
     is_time: tuple[bool, ...]
+    spelled: tuple[str, ...] = ()
 
     @property
     def shape(self) -> str:
@@ -125,7 +126,7 @@ def parse_name(text: str, places: int | None = None) -> Name:
     ('frame-*.depth', ('3.25',))
     """
     stem, suffix = splitext(text)
-    parts, numbers, is_time, end = [], [], [], 0
+    parts, numbers, is_time, spelled, end = [], [], [], [], 0
     while end < len(stem):
         match, written, timed = _next_number(stem, end, places)
         if match is None:
@@ -133,8 +134,9 @@ def parse_name(text: str, places: int | None = None) -> Name:
         parts.append(stem[end : match.start()])
         numbers.append(written)
         is_time.append(timed)
+        spelled.append(match[0])
         end = match.end()
-    return Name(text, (*parts, stem[end:]), suffix.lower(), tuple(numbers), tuple(is_time))
+    return Name(text, (*parts, stem[end:]), suffix.lower(), tuple(numbers), tuple(is_time), tuple(spelled))
 
 
 def _next_number(stem: str, start: int, places: int | None) -> tuple[re.Match[str] | None, str, bool]:
@@ -217,10 +219,7 @@ class NumberColumns:
     def pattern(self) -> str:
         """Returns the names with ``*`` where they differ."""
         first, varying = self.names[0], set(self.varying())
-        shown = [
-            "*" if k in varying or len(self.names) == 1 or first.is_time[k] else number
-            for k, number in enumerate(first.numbers)
-        ]
+        shown = ["*" if k in varying or len(self.names) == 1 else number for k, number in enumerate(first.spelled)]
         text = first.parts[0] + "".join(number + part for number, part in zip(shown, first.parts[1:]))
         return text + splitext(first.text)[1]
 
@@ -238,19 +237,20 @@ class NumberColumns:
 
     def tells_times(self, column: int) -> bool:
         """Returns whether all numbers of a column are dates or seconds, or may be times since 1970."""
-        return self._seconds(column) is not None
+        return self.seconds(column) is not None
 
     def times(self) -> np.ndarray | None:
         """Returns the seconds between the first name's time and each, f64 (F); None unless all hold times, rising."""
         for column in self.varying():
-            seconds = self._seconds(column)
+            seconds = self.seconds(column)
             if seconds is not None and all(a < b for a, b in zip(seconds, seconds[1:])):
                 since = np.array([float(second - seconds[0]) for second in seconds])
                 if np.median(np.diff(since)) >= _SHORTEST:
                     return since
         return None
 
-    def _seconds(self, column: int) -> list[Decimal] | None:
+    def seconds(self, column: int) -> list[Decimal] | None:
+        """Returns the seconds that the numbers of a column tell, None where they may be no times."""
         numbers = self.columns[column]
         if all(name.is_time[column] for name in self.names):
             return [_in_seconds(number, self.counted[column]) for number in numbers]

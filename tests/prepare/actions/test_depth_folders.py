@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.actions.depth_units import LIKE_TUM
+from dpcli.prepare.decode.calibration import read_calibration
 
 RNG = np.random.default_rng(0)
 
@@ -226,6 +230,41 @@ def test_folders_beside_depth_are_left_out_by_name(tmp_path, depth_at, beside):
     assert f"left out, by their names beside depth: {', '.join(sorted(beside))}" in reader.summary(reader.items())
     reader = DepthVideos(inputs=(tmp_path / "in" / beside[0],))
     assert len(reader.items()) == 1  # who names it, gets it
+
+
+def test_masks_of_each_object_beside_depth_need_no_pattern(tmp_path):
+    """Folders as BOP has them: depth, and masks named FRAME_OBJECT."""
+    write(tmp_path / "depth", **{f"{t:06d}": depth(1000 + t) for t in (0, 1)})
+    for folder in ("mask", "mask_visib"):
+        write(tmp_path / folder, **{f"{t:06d}_{k:06d}": np.zeros((6, 8), np.uint8) for t in (0, 1) for k in (0, 1)})
+    reader, sequence = read(tmp_path)
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert "left out, by their names beside depth: mask, mask_visib" in reader.summary(reader.items())
+
+
+@pytest.mark.parametrize(("name", "told"), [("associations.txt", True), ("depth.txt", True), ("notes.txt", False)])
+def test_far_depths_beside_the_lists_of_tum_are_told(tmp_path, name, told):
+    write(tmp_path / "depth", **{str(t): depth(7003 + t) for t in (0, 1)})
+    (tmp_path / name).write_text("0 depth/0.png\n1 depth/1.png\n")
+    reader = DepthVideos(inputs=(tmp_path,))
+    assert (LIKE_TUM.format(name) in reader.read(reader.items()[0], RNG).notes) is told
+    near = DepthVideos(inputs=(tmp_path,), depth_scale=5000)
+    assert not near.read(near.items()[0], RNG).notes
+
+
+def test_depth_aligned_to_color_is_not_of_the_depth_camera(tmp_path):
+    """What a file of both cameras of a RealSense says, in pictures as DexYCB names them."""
+    cameras = {name: {"fx": f, "fy": f, "ppx": 3.5, "ppy": 2.5} for name, f in (("color", 16.0), ("depth", 10.0))}
+    (tmp_path / "both.json").write_text(json.dumps(cameras))
+    (tmp_path / "color.json").write_text(json.dumps(cameras["color"]))
+    folder = write(tmp_path / "v", **{f"aligned_depth_to_color_{t}": depth(1000) for t in (0, 1)})
+    both, color = (read_calibration(tmp_path / f"{name}.json") for name in ("both", "color"))
+    with pytest.raises(
+        DataError, match=r"aligned to the color camera, but of the cameras in .*both.json the one called depth"
+    ):
+        read(folder, calibration=both)
+    np.testing.assert_allclose(read(folder, calibration=color)[1].points[0], [-3.5 / 16, -2.5 / 16, 1])
+    assert f"{tmp_path / 'both.json'}: of its cameras the one called depth is taken" in both.notes()
 
 
 def test_folders_of_other_names_stay(tmp_path):

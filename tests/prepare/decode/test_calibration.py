@@ -84,6 +84,20 @@ FORMS = [
     ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
     ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
     ("k.json", {**{k: str(v) for k, v in PLAIN.items()}, "width": "640", "height": "480"}, (640, 480)),
+    (
+        "k.json",
+        {
+            "parameters": [{"extrinsic": [1], "intrinsic": {"width": 640, "height": 480, "intrinsic_matrix": COLUMNS}}]
+            * 2
+        },
+        (640, 480),
+    ),
+    (
+        "k.json",
+        {"cameraData": [[0, {"intrinsicMatrix": NESTED, "width": 640, "height": 480, "distortionCoeff": [0] * 14}]]},
+        (640, 480),
+    ),
+    ("k.json", {str(t): {"cam_K": ROWS, "cam_t_w2c": [t]} for t in range(3)}, (0, 0)),
     ("k.yaml", ROS, (640, 480)),
     ("k.yml", OPENCV, (640, 480)),
     ("k.yaml", KALIBR, (640, 480)),
@@ -123,6 +137,7 @@ def test_matrices_of_numpy_and_opencv(tmp_path):
         ("depth_scale", 4000.0, 4000),
         ("depth_scale", 0.00025, 4000),
         ("depth_units", 0.001, 1000),
+        ("depth_scale_in_mm", 0.1, 10000),
         ("scale", 6553.5, 6553.5),
         ("depth_unit", "mm", 1000),
         ("depthScaleFactor", 10000, 10000),
@@ -249,6 +264,16 @@ def test_a_calibration_of_larger_pictures_is_scaled(factor, width, height):
     assert small.cx == pytest.approx(width / 2 - 0.5) and small.cy == pytest.approx(1.5 / factor - 0.5)
 
 
+def test_a_scene_of_bop_multiplies_raw_depths_to_millimeters(tmp_path):
+    frames = {str(t): {"cam_K": ROWS, "depth_scale": 0.1} for t in range(2)}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(frames))
+    assert read_calibration(tmp_path / "scene_camera.json").depth_scale == 10_000
+    frames["1"] = {"cam_K": [700.0, *ROWS[1:]], "depth_scale": 0.1}
+    (tmp_path / "scene_camera.json").write_text(json.dumps(frames))
+    with pytest.raises(DataError, match=r"holds several cameras \(0, 1\)"):
+        read_calibration(tmp_path / "scene_camera.json")
+
+
 def test_another_shape_and_a_center_outside_are_refused(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps(REALSENSE))
     with pytest.raises(DataError, match="is of 640x480 pictures, these have 640x360, which is another shape"):
@@ -263,12 +288,50 @@ def test_fractions_of_a_picture_are_no_pixels():
         Calibration(Intrinsics(0.9, 1.2, 0.5, 0.5), source="k.json").of_pictures(640, 480)
 
 
+def test_a_lens_that_is_called_no_fisheye_is_one_of_brown(tmp_path):
+    (tmp_path / "k.yml").write_text(OPENCV.replace("0., 0., 0., 0., 0.", "0.1, 0., 0., 0., 0.") + "fisheye_model: 0\n")
+    assert read_calibration(tmp_path / "k.yml").intrinsics == LensIntrinsics(FX, FY, CX, CY, (0.1, 0, 0, 0, 0))
+
+
 def test_the_depth_factor_and_the_lens_that_a_slam_declares(tmp_path):
     (tmp_path / "k.yaml").write_text(SLAM + "RGBD.DepthMapFactor: 5000.0\n")
     assert read_calibration(tmp_path / "k.yaml").depth_scale == 5000
     (tmp_path / "k.yaml").write_text(SLAM.replace("PinHole", "KannalaBrandt8").replace("k1: 0.0", "k1: 0.1"))
-    with pytest.raises(DataError, match="its lens is of model kannalabrandt8"):
+    with pytest.raises(DataError, match="its lens is of model KannalaBrandt8"):
         read_calibration(tmp_path / "k.yaml")
+
+
+OMNI = "  camera_model: omni\n  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n"
+MEI = "model_type: MEI\nmirror_parameters: {xi: 1.9}\nprojection_parameters: {gamma1: 670, gamma2: 669, u0: 378, v0: 280}\n"
+KB4 = {"camera_type": "kb4", "k1": 0.007, "k2": -0.001, "k3": 0.0004, "k4": -0.0001}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("k.yml", OPENCV + "xi: 1.2\n", "xi 1.2"),  # OpenCV's omnidirectional and fisheye calibrations
+        ("k.yml", OPENCV + "xi: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1.2 ]\n", r"xi \[1.2\]"),
+        ("k.yml", OPENCV.replace("0., 0., 0., 0., 0.", "0.1, 0., 0., 0.1") + "fisheye_model: 1\n", "fisheye_model 1"),
+        ("c.yaml", f"cam0:\n{OMNI}  intrinsics: [1.2, {FX}, {FY}, {CX}, {CY}]\n", "model omni"),  # Kalibr
+        (
+            "c.yaml",
+            KALIBR + "  distortion_model: equidistant\n  distortion_coeffs: [0, 0, 0, 0]\n",
+            "model equidistant",
+        ),
+        ("c.yaml", MEI, "model MEI"),  # CamOdoCal
+        ("k.json", {"intrinsics": {**PLAIN, **KB4}}, "model kb4"),  # Basalt
+        ("k.json", {**PLAIN, "xi": -0.24, "alpha": 0.57}, "xi -0.24"),
+        (
+            "transforms.json",
+            {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "k1": 0.1, "is_fisheye": True},
+            "is_fisheye True",
+        ),
+    ],
+)
+def test_lenses_of_no_pinhole_are_refused_by_name(tmp_path, name, content, what):
+    (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(DataError, match=f"its lens is of {what}, of a fisheye or the like.*undistort"):
+        read_calibration(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,15 @@ def test_numbers_of_no_vertex_are_refused(name, number, tmp_path):
         load_mesh(path, None)
 
 
+@pytest.mark.parametrize("corners", [3, 4])
+@pytest.mark.parametrize("name", ["m.ply", "m.off", "m.obj"])
+def test_faces_with_corners_at_nan_are_refused(name, corners, tmp_path):
+    """Such triangles have no area, so that sampling passed over them untold."""
+    path = written(tmp_path / name, np.vstack([OUTLINE[: corners - 1], np.full(2, np.nan)]))
+    with pytest.raises(ValueError, match="corners of its faces lie at NaN or infinity"):
+        load_mesh(path, None)
+
+
 def quantized(file: GlbFile) -> None:
     corners = np.zeros((4, 4), np.int16)
     corners[:, :2] = [[-32767, -32767], [32767, -32767], [32767, 32767], [-32767, 32767]]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
+from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.recordings.depth import read_recorded_depth
 from tests.support.recording_helpers import START, Messages, write_recording
 
@@ -45,3 +46,9 @@ def test_the_lens_and_the_units_that_texts_tell(tmp_path, model, lens):
 def test_a_lens_of_a_model_that_is_called_plumb_bob_and_is_none_is_named(tmp_path):
     with pytest.raises(DataError, match="its lens is of model inverse_brown_conrady with 5 coefficients"):
         read_recorded_depth(record(tmp_path, "Inverse Brown Conrady", (0.1, 0, 0, 0, 0)))
+
+
+def test_a_camera_that_is_given_stands_in_for_one_that_is_refused(tmp_path):
+    reader = DepthVideos(inputs=(record(tmp_path, "Inverse Brown Conrady", (0.1, 0, 0, 0, 0)),), fov=90.0)
+    points = reader.read(reader.items()[0], np.random.default_rng(0)).sequence.points
+    np.testing.assert_allclose(points[0], [-7.5 / 8 * 0.2, -5.5 / 8 * 0.2, 0.2], rtol=1e-6)
