@@ -66,12 +66,12 @@ function followTheme(changed) {
   return () => { chosen = root.hasAttribute("data-dark") ? "light" : "dark"; show(); };
 }
 
-// Keys do what `table` says whatever has the focus; only fields of text keep theirs, sliders and menus their arrows, boxes their space.
+// Keys do what `table` says whatever has the focus ("Shift+ArrowUp" with shift); only fields of text keep theirs, sliders and menus their arrows, boxes their space.
 function listenToKeys(table) {
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (keepsKey(event.target, event.key)) return;
-    const does = table()[event.key];
+    const does = table()[(event.shiftKey && event.key.startsWith("Arrow") ? "Shift+" : "") + event.key];
     if (does) { event.preventDefault(); does(); }
   });
   window.addEventListener("keyup", (event) => {  // Firefox presses a button when its space is let go
