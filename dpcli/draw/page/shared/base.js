@@ -23,7 +23,8 @@ function ready() {
 }
 
 async function unpacked(text, bytes) {
-  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
+  const letters = atob(text.trim()), packed = new Uint8Array(letters.length);
+  for (let i = 0; i < packed.length; i++) packed[i] = letters.charCodeAt(i);  // `Uint8Array.from` takes 20 times as long
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const whole = new Uint8Array(await new Response(stream).arrayBuffer());
   if (whole.length !== bytes) throw new Error(`the page is damaged: ${whole.length} bytes of data, expected ${bytes}`);
