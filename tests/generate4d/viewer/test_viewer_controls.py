@@ -156,6 +156,8 @@ def test_keys_do_what_the_list_says(page, tmp_path):
       for (const key of ["ArrowRight", "ArrowUp", "ArrowUp"]) press(key, { shiftKey: true });
       Object.assign(seen, app.state);
       seen.panel = !$("panel").hidden;
+      const contrast = (where) => getComputedStyle(document.querySelector(where)).forcedColorAdjust;
+      seen.contrast = [contrast("#ramp"), contrast('[data-color="depth"]')];
       seen.keys = Array.from($("panel").querySelectorAll("th"), (cell) => cell.textContent);
       await pause(200);
       const { width, height } = $("trails"), lines = $("trails").getContext("2d").getImageData(0, 0, width, height).data;
@@ -167,6 +169,7 @@ def test_keys_do_what_the_list_says(page, tmp_path):
       return { ...seen, saved };"""
     seen = _run(page, script, tmp_path, "time=0.1&play=0&azimuth=0&elevation=0")
     assert np.rad2deg([seen["azimuth"], seen["elevation"]]) == pytest.approx([5, 10]) and seen["time"] == 0.1
+    assert seen["contrast"] == ["none", "none"]  # else high contrast takes their colors away
     assert (seen["color"], seen["bounce"], seen["input"], seen["panel"], seen["trails"]) == (
         "depth",
         True,
