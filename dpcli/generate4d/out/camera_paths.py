@@ -14,7 +14,7 @@ from dpcli.store.gaussians import GaussianScene
 _SMOOTH = 24.0  # pictures per second that a moving camera needs at least
 _ROUND = 4.0  # seconds that the camera takes for its way, about: whole loops of the clip, so that the video loops, too
 _STILL_RATE = 15.0  # pictures per second of a scene of one frame
-_SOLID, _ENDS = 0.3, (0.01, 0.99)  # opacity of the object's Gaussians; quantiles of their places at its ends
+SOLID, _ENDS = 0.3, (0.01, 0.99)  # opacity of the object's Gaussians; quantiles of their places at its ends
 _MANY = 20_000  # places, about, that tell where these are
 # of half a picture: an object in the documented sphere, before the camera of an unknown clip, stays within
 _AWAY = 0.82
@@ -72,23 +72,42 @@ class Lens:
 
 
 def pivot(scene: GaussianScene) -> np.ndarray:
-    """Returns the point f64 (3) that cameras turn around: the origin, or the object's middle where that is far from it.
+    """Returns the point f64 (3) that cameras turn around: `turning_point` of what is solid in some frames."""
+    solid, camera = scene.opacity >= min(SOLID, scene.opacity.max()), scene.reference
+    places = scene.frame_mean[:: max(1, scene.num_frames // 8), solid]
+    return turning_point(places, scene.camera_world_to_camera[camera], scene.camera_intrinsics[camera], scene.size)
+
+
+def turning_point(
+    places: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Returns the origin f64 (3), or the middle of an object's places (...,3) where that is far from it.
 
     Far is what a camera in the reference's place would have at its picture's border, or not at all, if it looked at the origin.
     """
-    solid = scene.opacity >= min(_SOLID, scene.opacity.max())
-    places = scene.frame_mean[:: max(1, scene.num_frames // 8), solid].reshape(-1, 3).astype(np.float64)
+    places = places.reshape(-1, 3).astype(np.float64)
     middle = np.quantile(places[:: max(1, len(places) // _MANY)], _ENDS, axis=0).mean(0)
-    focal = scene.camera_intrinsics[scene.reference][[0, 1], [0, 1]]
-    half = orbit_of(scene.camera_world_to_camera[scene.reference])[2] * (scene.size / focal).min() / 2
+    half = orbit_of(world_to_camera)[2] * (np.array(size) / intrinsics[[0, 1], [0, 1]]).min() / 2
     return np.zeros(3) if np.linalg.norm(middle) <= _AWAY * half else middle
+
+
+def seen_from(middle: np.ndarray, world_to_camera: np.ndarray) -> tuple[float, float, float]:
+    """Returns azimuth, elevation and distance of a camera, seen from a point (3)."""
+    pose = world_to_camera.copy()
+    pose[:3, 3] += pose[:3, :3] @ middle
+    return orbit_of(pose)
+
+
+def orbit_around(middle: np.ndarray, azimuth: float, elevation: float, radius: float) -> np.ndarray:
+    """Returns world_to_camera f64 (4,4) of a camera that looks at a point (3), as `orbit_pose` at the origin."""
+    pose = orbit_pose(azimuth, elevation, radius)
+    pose[:3, 3] -= pose[:3, :3] @ middle
+    return pose
 
 
 def home(scene: GaussianScene) -> tuple[float, float, float]:
     """Returns azimuth, elevation and distance of the reference camera, seen from `pivot`; as far as all reaches where it stands there."""
-    pose = scene.camera_world_to_camera[scene.reference].copy()
-    pose[:3, 3] += pose[:3, :3] @ pivot(scene)
-    azimuth, elevation, distance = orbit_of(pose)
+    azimuth, elevation, distance = seen_from(pivot(scene), scene.camera_world_to_camera[scene.reference])
     return azimuth, elevation, distance if distance > scene.near else scene.reach
 
 
@@ -166,7 +185,5 @@ def _poses(scene: GaussianScene, path: str, lens: Lens, count: int) -> list[np.n
         azimuths = azimuth + _SWING * np.sin(turn)
     if path == "orbit":
         elevations = np.clip(elevation + _BOB * np.sin(turn), -np.pi / 2, np.pi / 2)
-    middle, poses = pivot(scene), [orbit_pose(a, e, radius) for a, e in zip(azimuths, elevations, strict=True)]
-    for pose in poses:
-        pose[:3, 3] -= pose[:3, :3] @ middle
-    return poses
+    middle = pivot(scene)
+    return [orbit_around(middle, a, e, radius) for a, e in zip(azimuths, elevations, strict=True)]

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from dpcli.draw.palette import part_colors
 from dpcli.draw.sheet import save_picture, spread_evenly
+from dpcli.generate4d.out.camera_paths import SOLID, orbit_around, seen_from, turning_point
 from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.targets import Targets
-from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
@@ -74,23 +74,27 @@ def write_preview(fitted: Model4D | GaussianScene, targets: Targets, path: Path)
         instants = _instants_of_model(fitted, targets.times()[frames])
     size, color = (truth.shape[2], truth.shape[1]), instants.color.expand(len(frames), -1, -1)
     parts, weights = part_colors(instants.part.cpu().numpy()), weight_colors(instants.weight.cpu().numpy())
-    centered = intrinsics.clone()  # cameras aside look at the origin, wherever the reference has it in its picture
+    centered = intrinsics.clone()  # cameras aside look at the object, wherever the reference has it in its picture
     centered[:, :2, 2] = 0.5 * torch.tensor(size)
     rows = [
         truth[..., :3] + 1 - truth[..., 3:],
         _draw(instants, color, poses, intrinsics, size),
         _draw(instants, torch.from_numpy(parts / 255), poses, intrinsics, size),
         _draw(instants, torch.from_numpy(weights / 255), poses, intrinsics, size),
-        *(_draw(instants, color, _aside(targets, turn).expand(len(frames), 4, 4), centered, size) for turn in _SIDES),
+        *(_draw(instants, color, pose.expand(len(frames), 4, 4), centered, size) for pose in _aside(instants, targets)),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
     save_picture((sheet.clamp(0, 1) * 255).round().byte().numpy(), path)
 
 
-def _aside(targets: Targets, turn: float) -> Tensor:  # [4, 4]
-    """Returns a camera `turn` degrees about the upright from the reference camera, and above it."""
-    azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
-    return torch.from_numpy(orbit_pose(azimuth + np.deg2rad(turn), elevation + 0.3, radius))
+def _aside(instants: _Instants, targets: Targets) -> list[Tensor]:  # of [4, 4]
+    """Returns cameras about the upright from the reference camera by _SIDES, and above it, around what those of `render` turn around."""
+    pose, lens = targets.world_to_camera[targets.reference], targets.intrinsics[targets.reference]
+    places = instants.mean[:, instants.opacity >= min(SOLID, float(instants.opacity.max()))]
+    middle = turning_point(places.cpu().numpy(), pose, lens, targets.size)
+    azimuth, elevation, radius = seen_from(middle, pose)
+    turned = (orbit_around(middle, azimuth + np.deg2rad(turn), elevation + 0.3, radius) for turn in _SIDES)
+    return [torch.from_numpy(pose) for pose in turned]
 
 
 def _draw(instants: _Instants, colors: Tensor, poses: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:

@@ -123,7 +123,7 @@ def describe(
             "radius": radius,
             "target": pivot(scene).tolist(),
             "near": scene.near,
-            "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
+            "half": [float(side / 2 / focal) for side, focal in zip(scene.size, (lens[0, 0], lens[1, 1]))],
         },
         "parts": [
             {"id": int(i), "count": int(c), "color": part_colors(np.array([i]))[0].tolist()}

@@ -9,12 +9,12 @@ const KEYS = [
   ["space", "play or stop"], ["← →", "one frame back, on"], ["1 2 3 4", "appearance, parts, rigid weight, depth"], ["t", "trajectories"],
   ["o", "the input picture"], ["a", "turn by itself"], ["p", "back and forth, or round and round"], ["b", "background"], ["+ −", "nearer, farther"],
   ["r", "the input's view"], ["f", "full screen"], ["l", "copy a link to this view"], ["s", "save a picture"], ["? i", "this panel"],
-  ["drag", "turn"], ["wheel, pinch", "zoom"], ["shift-drag, two fingers", "move"], ["double click, double tap", "turn around that point"],
+  ["drag, shift ← → ↑ ↓", "turn"], ["wheel, pinch", "zoom"], ["shift-drag, two fingers", "move"], ["double click, double tap", "turn around that point"],
 ];
 
 class App extends Stage {
   constructor(header, scene) {
-    super($("canvas"), header.camera.fovy, scene.timeline);
+    super($("canvas"), header.camera.half, scene.timeline);
     Object.assign(this, { header, scene, hidden: new Set() });
     const { radius } = header.camera;  // of a scene in any unit, or seen through a long lens
     this.radii = [Math.min(this.radii[0], radius / 40), Math.max(this.radii[1], 50 * radius)];
@@ -215,8 +215,8 @@ class App extends Stage {
       1: () => this.change({ color: "appearance" }), 2: () => this.change({ color: "part" }), 3: () => this.change({ color: "rigid" }),
       4: () => this.change({ color: "depth" }), t: () => this.flip("trails"), o: () => this.flip("input"), a: () => this.flip("turn"),
       p: () => this.flip("bounce"), f: () => this.toggleFullScreen(), l: () => this.copyLink(), s: () => this.savePicture(),
-      b: () => this.nextGround(), r: () => this.goHome(), i: () => $("about").click(), "?": () => $("about").click(),
-      "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9),
+      b: () => this.nextGround(), i: () => $("about").click(), "?": () => $("about").click(),
+      ...this.cameraKeys,
     }));
   }
 

@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import typer
+from PIL import Image
 
 from dpcli.cli.generate4d.render import render
 from dpcli.draw.palette import PALETTE, part_colors
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, pivot, plan_shots
 from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
+from dpcli.generate4d.out.preview import write_preview
 from dpcli.generate4d.out.render import Look, Renderer, render_views
 from dpcli.generate4d.render_settings import CATALOG
+from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
@@ -196,6 +200,19 @@ def test_cameras_turn_around_an_object_that_is_not_at_the_origin(away, scene, re
             assert (middle[:, 2] > 0).all() and (0 < pixels).all() and (pixels < 48).all()
             assert one.time == two.time
     np.testing.assert_array_equal(pivot(shifted(scene, moved / np.linalg.norm(moved) * 0.5)), 0)  # as ever
+
+
+@pytest.mark.parametrize("away", [(0, 0, 0), (1.6, 0, 0), (-30, 5, 9)])
+def test_a_preview_shows_the_sides_of_an_object_that_is_not_at_the_origin(away, scene, tmp_path):
+    moved, size = shifted(scene, np.array(away)), 48
+    pictures = torch.zeros(2, scene.num_frames, size, size, 4, dtype=torch.float16)
+    cameras = moved.camera_intrinsics, moved.camera_world_to_camera
+    write_preview(moved, Targets("toy", pictures, *cameras, moved.time, 0), tmp_path / "p.png")
+    sheet = np.asarray(Image.open(tmp_path / "p.png")).astype(int).min(-1).reshape(9, size, -1, size)
+    for picture in sheet[4:].swapaxes(1, 2).reshape(-1, size, size):
+        rows, columns = np.nonzero(picture < 250)
+        assert len(rows) > 30 and abs(np.median(rows) - 24) < 10 and abs(np.median(columns) - 24) < 10
+        assert 0 < min(rows.min(), columns.min()) and max(rows.max(), columns.max()) < size - 1
 
 
 def test_a_camera_in_the_middle_of_what_it_sees_turns_around_all_of_it(scene):

@@ -29,7 +29,8 @@ _CLOCK = (
 _DRIVER = """
 <script>
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-const press = (key) => document.activeElement.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+const press = (key, more) =>
+  document.activeElement.dispatchEvent(new KeyboardEvent("keydown", { ...more, key, bubbles: true, cancelable: true }));
 const at = (x, y) => ({ pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true });
 const point = (name, x, y) => $("canvas").dispatchEvent(new PointerEvent(name, at(x, y)));
 HTMLElement.prototype.setPointerCapture = () => {};  // made-up pointers can't be captured
@@ -152,8 +153,11 @@ def test_keys_do_what_the_list_says(page, tmp_path):
     script = """
       const seen = {};
       for (const key of ["4", "t", "o", "p", "?"]) press(key);
+      for (const key of ["ArrowRight", "ArrowUp", "ArrowUp"]) press(key, { shiftKey: true });
       Object.assign(seen, app.state);
       seen.panel = !$("panel").hidden;
+      const contrast = (where) => getComputedStyle(document.querySelector(where)).forcedColorAdjust;
+      seen.contrast = [contrast("#ramp"), contrast('[data-color="depth"]')];
       seen.keys = Array.from($("panel").querySelectorAll("th"), (cell) => cell.textContent);
       await pause(200);
       const { width, height } = $("trails"), lines = $("trails").getContext("2d").getImageData(0, 0, width, height).data;
@@ -163,7 +167,9 @@ def test_keys_do_what_the_list_says(page, tmp_path):
       press("s");
       for (let wait = 0; wait < 50 && !saved; wait++) await pause(50);
       return { ...seen, saved };"""
-    seen = _run(page, script, tmp_path, "time=0.1&play=0")
+    seen = _run(page, script, tmp_path, "time=0.1&play=0&azimuth=0&elevation=0")
+    assert np.rad2deg([seen["azimuth"], seen["elevation"]]) == pytest.approx([5, 10]) and seen["time"] == 0.1
+    assert seen["contrast"] == ["none", "none"]  # else high contrast takes their colors away
     assert (seen["color"], seen["bounce"], seen["input"], seen["panel"], seen["trails"]) == (
         "depth",
         True,
@@ -177,14 +183,16 @@ def test_keys_do_what_the_list_says(page, tmp_path):
 
 @needs_browser
 def test_the_panel_closes_without_keys(page, tmp_path):
-    """On a phone, which has none, the panel covers the button that opened it."""
+    """On a phone, which has none, the panel covers the button that opened it; on its side, buttons leave room for the scene."""
     script = """
+      const low = $("look").getBoundingClientRect().bottom;
       $("about").click();
       const close = $("panel").querySelector("button"), { x, y, width, height } = close.getBoundingClientRect();
       const found = [$("panel").hidden, document.elementFromPoint(x + width / 2, y + height / 2) === close];
       close.click();
-      return [...found, $("panel").hidden];"""
-    assert _run(page, script, tmp_path) == [False, True, True]
+      return [...found, $("panel").hidden, low];"""
+    *found, low = _run(page, script, tmp_path)
+    assert found == [False, True, True] and low < 80
 
 
 @needs_browser

@@ -23,7 +23,8 @@ function ready() {
 }
 
 async function unpacked(text, bytes) {
-  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
+  const letters = atob(text.trim()), packed = new Uint8Array(letters.length);
+  for (let i = 0; i < packed.length; i++) packed[i] = letters.charCodeAt(i);  // `Uint8Array.from` takes 20 times as long
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const whole = new Uint8Array(await new Response(stream).arrayBuffer());
   if (whole.length !== bytes) throw new Error(`the page is damaged: ${whole.length} bytes of data, expected ${bytes}`);
@@ -66,12 +67,12 @@ function followTheme(changed) {
   return () => { chosen = root.hasAttribute("data-dark") ? "light" : "dark"; show(); };
 }
 
-// Keys do what `table` says whatever has the focus; only fields of text keep theirs, sliders and menus their arrows, boxes their space.
+// Keys do what `table` says whatever has the focus ("Shift+ArrowUp" with shift); only fields of text keep theirs, sliders and menus their arrows, boxes their space.
 function listenToKeys(table) {
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (keepsKey(event.target, event.key)) return;
-    const does = table()[event.key];
+    const does = table()[(event.shiftKey && event.key.startsWith("Arrow") ? "Shift+" : "") + event.key];
     if (does) { event.preventDefault(); does(); }
   });
   window.addEventListener("keyup", (event) => {  // Firefox presses a button when its space is let go

@@ -1,9 +1,11 @@
 // A camera that orbits: drag turns and lets it coast, wheel or pinch zooms, shift-drag or two fingers move.
 
-const COAST = 6, IDLE = 0.02, TURN = 20 * Math.PI / 180;  // 1/s that coasting fades by; radians/s: too slow to see, turning by itself
+const COAST = 6, IDLE = 0.02, TURN = 20 * DEGREE;  // 1/s that coasting fades by; radians/s: too slow to see, turning by itself
+const NUDGE = 5 * DEGREE;  // of a key
 
 // Right-handed world, y up; azimuth 0 looks from +z, positive towards +x. Camera axes: x right, y down, z forward.
-function cameraOf(state, fovy, canvas) {
+// `half`: half the width and the height of what it shows at least, at a distance of 1.
+function cameraOf(state, half, canvas) {
   const { azimuth: a, elevation: e, radius, target } = state;
   const forward = [-Math.cos(e) * Math.sin(a), -Math.sin(e), -Math.cos(e) * Math.cos(a)], right = [Math.cos(a), 0, -Math.sin(a)];
   const down = [forward[1] * right[2] - forward[2] * right[1], forward[2] * right[0] - forward[0] * right[2],
@@ -11,7 +13,7 @@ function cameraOf(state, fovy, canvas) {
   const rotation = [...right, ...down, ...forward], { width, height } = canvas;
   const shift = [0, 1, 2].map((k) => -(rotation[3 * k] * target[0] + rotation[3 * k + 1] * target[1] + rotation[3 * k + 2] * target[2]));
   shift[2] += radius;
-  return { rotation, shift, forward, right, down, width, height, focal: 0.5 * Math.min(width, height) / Math.tan(fovy / 2) };
+  return { rotation, shift, forward, right, down, width, height, focal: 0.5 * Math.min(width / half[0], height / half[1]) };
 }
 
 // Matrices are columns in GLSL.
@@ -19,12 +21,12 @@ const asColumns = (R) => [R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]];
 
 // Adds azimuth, elevation, radius and target to the state; `home()` says where the camera begins. `radii`: least and largest radius.
 class Stage extends Player {
-  constructor(canvas, fovy, timeline) {
+  constructor(canvas, half, timeline) {
     super(timeline);
-    Object.assign(this, { canvas, fovy, spin: [0, 0], pace: [0, 0], radii: [0.05, 100] });
+    Object.assign(this, { canvas, half, spin: [0, 0], pace: [0, 0], radii: [0.05, 100] });
   }
 
-  get camera() { return cameraOf(this.state, this.fovy, this.canvas); }
+  get camera() { return cameraOf(this.state, this.half, this.canvas); }
 
   change(values) {
     const state = Object.assign(this.state, values);
@@ -76,6 +78,15 @@ class Stage extends Player {
     const far = Math.hypot(...target.map((value, k) => value - this.glide[k]));
     if (far < 1e-3 * this.state.radius) this.glide = null;
     this.change({ target });
+  }
+
+  // Keys that do what dragging and the wheel do.
+  get cameraKeys() {
+    const nudge = (across, up) => () => this.change({ azimuth: this.state.azimuth + across * NUDGE, elevation: this.state.elevation + up * NUDGE });
+    return {
+      "Shift+ArrowLeft": nudge(-1, 0), "Shift+ArrowRight": nudge(1, 0), "Shift+ArrowUp": nudge(0, 1), "Shift+ArrowDown": nudge(0, -1),
+      r: () => this.goHome(), "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9),
+    };
   }
 
   zoom(factor) { this.change({ radius: this.state.radius * factor }); }

@@ -10,15 +10,16 @@ const KEYS = [
   ["1 … 5", "what the colors tell"],
   [", .", "smaller or larger points"],
   ["+ −", "nearer or farther, as the wheel or a pinch"],
+  ["shift ← → ↑ ↓", "turn"],
   ["drag", "turn; with shift, or two fingers: move"],
   ["r", "the first view"],
   ["u", "another axis upright"],
 ];
-const FOVY = 32 * DEGREE, GROUND = { light: [252, 252, 253], dark: [22, 26, 34] };
+const HALF = Math.tan(16 * DEGREE), GROUND = { light: [252, 252, 253], dark: [22, 26, 34] };
 
 class PointsPage extends Stage {
   constructor(header) {
-    super($("canvas"), FOVY, PointsPage.timelineOf(header.sequences[0]));
+    super($("canvas"), [HALF, HALF], PointsPage.timelineOf(header.sequences[0]));
     Object.assign(this, { header, hidden: new Set(), data: [], at: 0 });
     Object.assign(this.state, { color: header.looks[0], dots: 1, azimuth: 0, elevation: 0, radius: 3, target: [0, 0, 0] });
     this.painter = this.painterOf();
@@ -71,8 +72,8 @@ class PointsPage extends Stage {
     return {
       ...Object.fromEntries(looks), " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1),
       "]": next, "[": before, PageDown: next, PageUp: before, ArrowDown: next, ArrowUp: before, ",": smaller, ".": larger,
-      r: () => this.goHome(), u: () => this.nextUp(), b: () => this.toggleTheme(), "?": () => $("open-about").click(), Escape: () => { $("about").hidden = true; },
-      "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9),
+      u: () => this.nextUp(), b: () => this.toggleTheme(), "?": () => $("open-about").click(), Escape: () => { $("about").hidden = true; },
+      ...this.cameraKeys,
     };
   }
 
@@ -121,7 +122,7 @@ class PointsPage extends Stage {
   home() {
     const view = { azimuth: 28 * DEGREE, elevation: 14 * DEGREE, target: [0, -0.09, 0], radius: 1 };
     this.turned = false;
-    return { ...view, radius: this.clip.distance(cameraOf(view, this.fovy, this.canvas), view.target) };
+    return { ...view, radius: this.clip.distance(cameraOf(view, this.half, this.canvas), view.target) };
   }
 
   // A picture of another size shows all again, unless the reader chose what to see.
