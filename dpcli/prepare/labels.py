@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,8 @@ from dpcli.runtime.progress import log
 _WHOLE = re.compile(r"^(-?\d+)[.,]0+$")  # as programs write a column of numbers that has a gap
 _NUMBERED = re.compile(r"([^\W\d]+[ _.-]?)(\d{1,9})")  # such as s01
 _BETWEEN = re.compile(r"[\s_-]+")
+_UNKNOWN = {"nan", "null", "n/a", "#n/a", "none", "unknown", "?", "-"}  # who is seen
+_MOST_PEOPLE = 10**9  # numbers that names lead to: two of a hundred people share one in 1 of 200,000 tables
 
 
 @dataclass(frozen=True)
@@ -146,13 +149,13 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         class_names = sorted(words)
     _warn_of_classes(path, class_names, labels)
     places = {name: place for place, name in enumerate(class_names)}
-    rows, people = {}, _people(record.get("subject", "") for record in records.values())
+    rows, people = {}, _people(path, (record.get("subject", "") for record in records.values()))
     for name, record in records.items():
         where = f"{path}:{record['line']}"
         label = int(record["label"]) if _is_number(record["label"]) else places[record["label"]]
         if label < 0:
             raise DataError(f"{where}: label {label} is out of range; labels count from 0")
-        subject = people.get(record.get("subject", ""), record.get("subject", "")) or "-1"
+        subject = people[record.get("subject", "")] or "-1"
         if not _is_number(subject) or len(subject) > 10 or int(subject) >= 1 << 31:
             raise DataError(
                 f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31: number the people, alike in all tables"
@@ -176,14 +179,30 @@ def _warn_of_one_number(path: Path, words: Iterable[str]) -> None:
             )
 
 
-def _people(subjects: Iterable[str]) -> dict[str, str]:
-    """Returns the numbers in subjects that are all spelled alike, such as s01 and s12, or 1.0; {} where they aren't."""
-    known = {subject for subject in subjects if subject}
-    whole = {subject: _WHOLE.sub(r"\1", subject) for subject in known}
-    found = [_NUMBERED.fullmatch(subject) for subject in whole.values()]
-    if known and all(found) and len({match[1] for match in found if match}) == 1:
-        return {subject: str(int(match[2])) for subject, match in zip(whole, found) if match}
-    return whole
+def _people(path: Path, subjects: Iterable[str]) -> dict[str, str]:
+    """Returns the numbers of subjects that are all spelled alike, such as s01 and s12, or 1.0, or that are all names without
+    digits, whose numbers are the same in every table; the subjects themselves where they are neither.
+    """
+    whole = {subject: _WHOLE.sub(r"\1", subject) for subject in subjects}
+    whole = {subject: "" if own.lower() in _UNKNOWN else own for subject, own in whole.items()}
+    known = {own for own in whole.values() if own}
+    found = {own: match for own in known if (match := _NUMBERED.fullmatch(own))}
+    numbers = {}
+    if len(found) == len(known) and len({match[1] for match in found.values()}) == 1:
+        numbers = {own: str(int(match[2])) for own, match in found.items()}
+    elif known and all(re.search(r"[^\W\d_]", own) and not re.search(r"\d", own) for own in known):
+        numbers = {own: str(zlib.crc32(_one_spelling(own).encode()) % _MOST_PEOPLE) for own in sorted(known)}
+        if len({*numbers.values()}) < len({*map(_one_spelling, known)}):
+            raise DataError(f"{path}: two names of subjects lead to one number; number the people, alike in all tables")
+        log.info(
+            f"{path}: people are known by numbers that follow from their names, alike in all tables:"
+            f" {first_names([f'{own} {number}' for own, number in numbers.items()], 8)}"
+        )
+    return {subject: numbers.get(own, own) for subject, own in whole.items()}
+
+
+def _one_spelling(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> None:

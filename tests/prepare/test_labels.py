@@ -82,6 +82,17 @@ def test_subjects_are_the_numbers_in_their_names(tmp_path, spelled):
     assert [row.subject for row in table(tmp_path, "name,label,subject\n" + rows).rows.values()] == [-1, 3, 12]
 
 
+def test_people_called_by_name_have_the_same_numbers_in_every_table(tmp_path, capsys):
+    def people(*names):
+        rows = "".join(f"v{k};wave;{name}\n" for k, name in enumerate(names))
+        return [row.subject for row in table(tmp_path, "name;label;subject\n" + rows).rows.values()]
+
+    first = people("J\u00f6rg", "Anna-Lena Groß", "李雷", "NaN", "")
+    assert "Anna-Lena Groß" in capsys.readouterr().err
+    assert people("Zoe", "li", "jo\u0308rg", "unknown", "李雷")[2:] == [first[0], -1, first[2]]
+    assert len({*first, *people("Zoe", "li")}) == 6 and max(first) < 1 << 31 and first[3:] == [-1, -1]
+
+
 @pytest.mark.parametrize("comma", [".", ","])
 def test_whole_numbers_may_be_written_with_a_fraction_of_0(tmp_path, comma):
     rows = "".join(f"v{k};{k}{comma}0;{k + 7}{comma}00\n" for k in (0, 2, 11))
@@ -89,7 +100,7 @@ def test_whole_numbers_may_be_written_with_a_fraction_of_0(tmp_path, comma):
     assert [(row.label, row.subject) for row in read.rows.values()] == [(0, 7), (2, 9), (11, 18)]
 
 
-@pytest.mark.parametrize("subjects", [("m1", "f1"), ("anna", "ben"), ("s1", "2"), ("1.5", "2.5")])
+@pytest.mark.parametrize("subjects", [("m1", "f1"), ("anna", "ben2"), ("s1", "2"), ("1.5", "2.5"), ("+", "*")])
 def test_subjects_whose_numbers_may_be_of_two_people_are_refused(tmp_path, subjects):
     with pytest.raises(DataError, match="expected a whole number .*: number the people, alike in all tables"):
         table(tmp_path, "name,label,subject\n" + "".join(f"v{k},wave,{one}\n" for k, one in enumerate(subjects)))

@@ -27,26 +27,43 @@ _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shap
 _FEWER = 2.0  # times as many points in training: a model that learned from points repeated as often expects them
 _OTHER_RATE = 1.5  # times as many frames a second
 # of MSR-Action3D's training videos, which the shipped networks' files don't say
-_SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15, "x": 0.074, "y": 0.208, "z": 0.037}
+_SHIPPED = {"extent": 0.233, "frames": 76.0, "interval": 1 / 15, "x": 0.074, "y": 0.208, "z": 0.037} | {
+    "at_x": -0.12,
+    "at_y": 0.08,
+    "at_z": 1.7,
+}
 _LONG = 2.0  # times as far along one axis as along the others, as a body that stands
+_AHEAD = 1.5  # times as far from the origin along one axis as along the others: where a sensor there looks
+_APART = 2.0  # extents from the origin, from which on that is no matter of the body itself
 _ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
+_PLACE = "at_x", "at_y", "at_z"
 _FINE = 1e-5  # of coordinates up to 100: what lies in one point there is not rounded to it
 _EXPECT = "; expect fewer right than in its training (another sensor?)"
 
 
 def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
-    """Returns the median distance of points f32 (N,3) of some frames from their median, also along each axis, the median number
-    of points of a frame, and the step to which float32 rounds coordinates so far from the origin; {} where no frame has any."""
+    """Returns the median distance of points f32 (N,3) of some frames from their median, also along each axis, where that lies,
+    the median number of points of a frame, and the step to which float32 rounds coordinates so far from the origin; {} where
+    no frame has any."""
     points = np.concatenate(frames) if len(frames) else np.zeros((0, 3))
     if not len(points):
         return {}
-    away = points - np.median(points, 0)
+    middle = np.median(points, 0)
+    away = points - middle
     distance = np.linalg.norm(away, axis=1)
-    along = dict(zip("xyz", np.median(np.abs(away), 0).tolist()))
+    along = dict(zip("xyz", np.median(np.abs(away), 0).tolist())) | dict(zip(_PLACE, middle.tolist()))
     sizes = [len(frame) for frame in frames]
     step = np.spacing(np.abs(points).max().astype(np.float32))
     return {"extent": float(np.median(distance)), "points": float(np.median(sizes)), "step": float(step), **along}
+
+
+def _ahead(found: dict[str, float]) -> str:
+    """Returns the direction, such as +z, in which what `like` saw lies from the origin, "" where it isn't clearly one."""
+    place = {key: found.get(key, 0.0) for key in _PLACE}
+    other, ahead = sorted(place, key=lambda key: abs(place[key]))[1:]
+    clear = abs(place[ahead]) > max(_AHEAD * abs(place[other]), _APART * found.get("extent", np.inf))
+    return f"{'-' if place[ahead] < 0 else '+'}{ahead[-1]}" if clear else ""
 
 
 def _longest_axis(found: dict[str, float]) -> str:
@@ -106,8 +123,8 @@ def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
     """Returns `file_like` of the videos that a model learned from, as far as it is known."""
     own = info.notes.get(NOTE) or (_SHIPPED if find_model(model).parent == SHIPPED else {})
     numbers = own if isinstance(own, dict) else {}
-    if numbers and (SHIPPED / f"{model}.safetensors").is_file():  # its notes may be older than those of axes
-        numbers = {axis: _SHIPPED[axis] for axis in "xyz"} | numbers
+    if numbers and (SHIPPED / f"{model}.safetensors").is_file():  # its notes may be older than those of axes and places
+        numbers = _SHIPPED | numbers
     return {key: value for key, value in numbers.items() if isinstance(value, int | float)}
 
 
@@ -219,6 +236,13 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
             " data again, clouds with --scale, depth videos with --depth-scale or --background"
         )
     if far is None:
+        return
+    forward, ahead = _ahead(own), _ahead(theirs)
+    if forward and ahead and forward != ahead:
+        log.warn(
+            f"{what}: what is seen lies along {ahead} from the origin, what {model} learned from along {forward}: has the sensor other"
+            " axes? Then expect fewer right; exchange the axes in the raw data to those of its training"
+        )
         return
     up, longest = _longest_axis(own), _longest_axis(theirs)
     if up and longest and up != longest:

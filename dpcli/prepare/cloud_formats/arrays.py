@@ -195,10 +195,16 @@ def read_bin(path: Path, columns: int) -> Cloud:
         raise DataError(
             f"{path}: {size} bytes are no whole number of points of {columns} float32; truncated, or see --bin-columns"
         )
-    values = np.fromfile(path, "<f4").reshape(-1, columns)[:, :3]
+    numbers = np.fromfile(path, "<f4")
+    values = numbers.reshape(-1, columns)[:, :3]
     size_of = np.abs(values[np.isfinite(values)])
-    if np.mean((size_of > _LARGEST) | ((size_of > 0) & (size_of < _SMALLEST))) > 0.01:
-        raise DataError(f"{path}: its bytes are no coordinates in float32 (another type, or a header before them)")
+    words = numbers.view(np.uint32)
+    rounded = len(words) % 2 == 0 and words.any() and not words[::2].any()  # float64 of few digits ends in zeros
+    if rounded or np.mean((size_of > _LARGEST) | ((size_of > 0) & (size_of < _SMALLEST))) > 0.01:
+        raise DataError(
+            f"{path}: its bytes are no coordinates in float32 (another type, or a header before them); if they are float64, as NumPy"
+            " writes by default, save them as .npy: numpy.save(NAME, numpy.fromfile(FILE, 'f8').reshape(-1, COLUMNS))"
+        )
     if len(values) and 0 < abs(values[0, 0]) < _SMALLEST:
         raise DataError(
             f"{path}: its first four bytes are no coordinate, but the whole number {values.view(np.uint32)[0, 0]}; a header"

@@ -379,8 +379,10 @@ def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None)
 
 
 def _advice(words: list[str]) -> str:
-    """Returns what to do where columns tell angles instead of lengths, or several points; "" where they do neither."""
+    """Returns what to do where columns tell angles instead of lengths, or several points, or lines are no rows; "" elsewhere."""
     known = {word.lower()[:3] for word in words}
+    if words[0].endswith(":"):
+        return "; of messages as `rostopic echo` prints them make a table (echo -p, or columns frame, x, y, z): a row for each point"
     if {"lat", "lon"} <= known:
         return "; project latitudes and longitudes to meters first"
     if len(find_trios(words)) > 1:

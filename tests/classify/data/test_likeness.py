@@ -60,6 +60,29 @@ def test_another_axis_that_is_upright_is_told(shape, longest, capsys):
     assert bool(said) is bool(longest)
 
 
+@pytest.mark.parametrize(
+    ("learned", "place", "ahead"),
+    [
+        ((0, 2, 1), (2, 0, 1), "+x"),  # a driver of ROS (x forward) after a radar's own axes (y forward)
+        ((0, 2, 1), (0, -2, 1), "-y"),
+        ((0, 2, 1), (1, 3, 0), ""),
+        ((0, 2, 1), (2, 2, 1), ""),  # between two axes
+        ((0, 2, 1), (0.3, 0, 0), ""),  # about the middle of a room, or of a body
+        ((1, 0.9, 0), (2, 0, 0), ""),
+        (None, (0, 0, 2), ""),  # MSR-Action3D, before its camera
+        (None, (0, 2, 0), "+y"),
+    ],
+)
+def test_people_who_stand_on_another_side_of_the_sensor_are_told(learned, place, ahead, capsys, tmp_path):
+    """Of 60 videos of MSR-Action3D msraction3d-24 has 98 % right, turned by 90 degrees about the vertical axis 33 %."""
+    own, notes = "msraction3d-24", {NOTE: {"extent": 0.233}}
+    if learned is not None:
+        own, notes = tmp_path / "m.safetensors", {NOTE: like([frame + np.float32(learned) for frame in body()])}
+        own.touch()
+    said = told(capsys, [frame + np.float32(place) for frame in body()], own, notes=notes)
+    assert (f"what is seen lies along {ahead} from the origin, what" in said) if ahead else not said
+
+
 def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
     own = tmp_path / "m.safetensors"
     own.touch()

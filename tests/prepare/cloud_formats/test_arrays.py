@@ -201,10 +201,14 @@ def test_few_points_are_kitti_s_unless_a_reflectance_is_negative(tmp_path):
     assert "3 float32 a point" in note and "other numbers fit as well" in note and "--bin-columns" in note
 
 
-def test_a_bin_of_another_type_is_refused(tmp_path):
-    np.random.default_rng(0).normal(size=(60, 4)).astype("<f8").tofile(tmp_path / "0.bin")
-    with pytest.raises(DataError, match="no coordinates in float32"):
-        read_bin(tmp_path / "0.bin", 4)
+@pytest.mark.parametrize("step", [0, 1 / 512])  # a radar's whole numbers of 1/512 m leave half of each float64 at zero
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_a_bin_of_another_type_is_refused(step, columns, tmp_path):
+    values = np.random.default_rng(0).normal(size=(60, columns))
+    (np.round(values / step) * step if step else values).astype("<f8").tofile(tmp_path / "0.bin")
+    for guess in (columns, 2 * columns):
+        with pytest.raises(DataError, match="no coordinates in float32 .* float64, as NumPy writes"):
+            read_bin(tmp_path / "0.bin", guess)
 
 
 def test_a_bin_that_holds_axis_after_axis_is_refused_unless_its_columns_are_said(tmp_path):

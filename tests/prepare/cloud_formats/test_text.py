@@ -132,6 +132,10 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
         ("\n\n", "no rows"),
         ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
+        (
+            "header: \n  seq: 6\nx: 1.0\ny: 2.0\nz: 0.5\n---\n",
+            "header:; .* make a table .*: a row for each point",
+        ),  # RadHAR
         ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
         ("x_mm,y_mm,z_m\n1,2,3\n", "different units"),
         ("# frame 0\n1 2 3\n# frame 1\n4 5 6\n", "comments such as '# frame 1' divide its rows into frames"),
