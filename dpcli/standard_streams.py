@@ -41,19 +41,6 @@ def ready_streams() -> None:
     sys.stderr = PrintableStream(_error_stream(2, closefd=False))
 
 
-def names_as_utf8() -> None:
-    """Starts this program again, once, where the locale isn't of UTF-8, so that names of files are the same texts on all machines.
-
-    Else a folder's class would have another name in a file than elsewhere, or a name in a file could be none of a folder. What
-    is printed keeps the locale's encoding.
-    """
-    if sys.getfilesystemencoding() == "utf-8" or "utf8" in sys._xoptions or not sys.executable:
-        return
-    if sys.__stdout__ is not None:
-        os.environ.setdefault("PYTHONIOENCODING", sys.__stdout__.encoding)
-    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
-
-
 def quiet_libraries() -> None:
     """Lets what C libraries write to stderr, such as libpng about each damaged picture, go nowhere; Python's stderr stays.
 
