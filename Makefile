@@ -18,6 +18,9 @@ endif
 DEMO_TRAIN ?= --preset tiny --timing uniform
 BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
+# Programs of tables read and write texts that hold letters such as ±, whatever the locale.
+export PYTHONUTF8 := 1
+
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test bench fuzz kills soak lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1

@@ -18,8 +18,10 @@ def main() -> None:
     import sys
 
     try:
+        from dpcli.interpreter import settle_interpreter
         from dpcli.standard_streams import hush_warnings, quiet_libraries, ready_streams
 
+        settle_interpreter()
         ready_streams()
         start_watchdog()
         if "--debug" not in sys.argv:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import zipfile
 from collections import Counter
@@ -90,7 +91,13 @@ def map_npy(path: Path) -> np.ndarray:
     which only the first would be read. FileNotFoundError passes.
     """
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except OSError as error:
+            if error.errno != errno.ENODEV:
+                raise
+            # some network file systems share no maps; of a private one what is written stays in memory
+            array = np.load(path, mmap_mode="c", allow_pickle=False)
     except FileNotFoundError:
         raise
     except Exception as error:  # ValueError, EOFError, tokenize.TokenError, SyntaxError... of damaged headers

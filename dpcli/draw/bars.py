@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,11 +71,10 @@ class Histogram:
 
 def draw_panels(panels: Sequence[Bars | Histogram], rows: int, headline: str, path: Path) -> None:
     """Writes panels side by side, as high as so many groups of bars need. Raises DataError when it can't be written."""
-    from matplotlib.figure import Figure
 
     longest = max((len(title) for panel in panels if isinstance(panel, Bars) for title in panel.titles), default=0)
     width = _WIDTH + _INCH_PER_LETTER * max(0, longest - _SHORT_TITLE)
-    figure = Figure(figsize=(width * len(panels), 1.6 + _INCH_PER_ROW * max(rows, 3)), layout="constrained")
+    figure = new_figure(width * len(panels), 1.6 + _INCH_PER_ROW * max(rows, 3))
     for number, panel in enumerate(panels):
         panel.draw(figure.add_subplot(1, len(panels), number + 1))
     figure.suptitle(headline, fontsize=10, parse_math=False)

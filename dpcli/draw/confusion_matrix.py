@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dpcli.draw.reliability import WIDTH, Reliability, draw_reliability
-from dpcli.draw.sheet import save_figure, shortened
+from dpcli.draw.sheet import new_figure, save_figure, shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,6 @@ def draw_confusion(
     Color is the share of the row's truth, the number in a cell the count. reliability: to be drawn beside it. Raises
     DataError when it can't be written.
     """
-    from matplotlib.figure import Figure
 
     classes = len(confusion)
     side = max(_SMALLEST, _INCH_PER_CLASS * classes)
@@ -36,7 +35,7 @@ def draw_confusion(
     margin = 0.4 + 0.065 * max(len(title) for title in titles)  # inches for the names, at 7 points
     wide, high = side + margin + 1.0, side + margin + 0.7
     more = WIDTH if reliability is not None else 0.0
-    figure = Figure(figsize=(wide + more, high), layout="constrained")
+    figure = new_figure(wide + more, high)
     if more:  # beside another subfigure the names of the axes come out nearer to the edge than the space around them
         figure.get_layout_engine().set(w_pad=0.1, h_pad=0.06)
     places = figure.subfigures(1, 2, width_ratios=(wide, more)) if more else [figure]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,10 +50,9 @@ def draw_learning_curves(rows: Sequence[Mapping[str, Any]], panels: Sequence[Pan
 
     Raises DataError when it can't be written.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(5.2 * len(panels), 3.8), layout="constrained")
+    figure = new_figure(5.2 * len(panels), 3.8)
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         own = rows if panel.rows is None else panel.rows
         lines = _plot(axes, own, panel.curves, x)

@@ -100,6 +100,17 @@ def _not_written(path: Path, error: Exception) -> DataError:
     return DataError(f"{path}: the picture cannot be written ({why}); name a .png in an existing folder")
 
 
+def new_figure(width: float, height: float) -> Figure:
+    """Returns an empty matplotlib figure, inches wide and high, by matplotlib's own defaults: a person's matplotlibrc, which may
+    ask for TeX or other sizes of letters, is for that person's own figures.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    matplotlib.rcdefaults()
+    return Figure(figsize=(width, height), layout="constrained")
+
+
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Writes a matplotlib figure, whole or not at all, with letters that its font lacks from others of this computer; warns of
     those that none has. Raises DataError when it can't be written.

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.classify.presets import PRESETS
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 from dpcli.reproduce.accuracy_tables import add_data, clouds_of
 from dpcli.reproduce.runs import (
     DASH,
@@ -190,9 +190,8 @@ def table(found: Found, about: str) -> str:
 
 def picture(found: Found, path: Path) -> None:
     """Draws four panels of boxes over folds, the thesis's choice filled."""
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 7), layout="constrained")
+    figure = new_figure(11, 7)
     for panel, (key, columns) in enumerate(found.items()):
         axes = figure.add_subplot(2, 2, panel + 1)
         known = {value: accuracies for value, accuracies in columns.items() if accuracies}

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli import __version__
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, Setting, add_plan, clips_of, clouds_of
 from dpcli.reproduce.runs import (
     DASH,
@@ -191,9 +191,8 @@ def _area(parameters: float) -> float:
 
 def picture(cost: Mapping[str, dict[str, Cost]], found: Found, path: Path) -> None:
     """Draws accuracy over operations, an area for the parameters: the thesis's hollow, ours filled where they are known."""
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.5, 5.5), layout="constrained")
+    figure = new_figure(8.5, 5.5)
     axes = figure.add_subplot()
     for (backbone, kind), (flops, parameters, accuracy) in THESIS.items():
         style = {"marker": _MARKS[kind], "edgecolors": _COLORS[backbone]}

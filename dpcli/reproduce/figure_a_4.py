@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.counted import counted
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 from dpcli.errors import DataError
 from dpcli.evaluate.classification.metrics import predicted_labels
 from dpcli.reproduce.runs import DASH, markdown, write_json, write_text
@@ -86,9 +86,8 @@ def _number(value: float, sign: str = "") -> str:
 
 def picture(names: Sequence[str], found: Mapping[str, np.ndarray], path: Path) -> None:
     """Draws a panel each: bars sorted by gain, blue up, red down."""
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(0.35 * len(names) + 2.5, 3.6 * len(found)), layout="constrained")
+    figure = new_figure(0.35 * len(names) + 2.5, 3.6 * len(found))
     for panel, (key, own) in enumerate(found.items()):
         axes = figure.add_subplot(len(found), 1, panel + 1)
         known = [k for k in np.argsort(-own, kind="stable") if not np.isnan(own[k])]

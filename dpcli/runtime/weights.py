@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from dpcli import __version__
 from dpcli.errors import DataError, UsageError, reading
-from dpcli.path_names import utf8_path
 from dpcli.regular_files import why_unreadable
 from dpcli.runtime.settings.stored import StoredConfig, from_json, json_value
 from dpcli.runtime.settings.value_types import numbers_in
@@ -88,13 +87,16 @@ def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str,
 
 
 def _with_sorted_header(content: bytes) -> bytes:
-    """Makes equal weights and texts equal bytes: the library writes the texts in another order each time. A file begins with
-    the length of its header, 8 bytes, and the header in JSON, perhaps with spaces behind it."""
-    length = int.from_bytes(content[:8], "little")
-    header = json.loads(content[8 : 8 + length])
+    """Makes equal weights and texts equal bytes: the library writes the texts in another order each time."""
+    length, header = int.from_bytes(content[:8], "little"), _header(content)
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([content[:8], text.ljust(length), content[8 + length :]]) if len(text) <= length else content
+
+
+def _header(content: bytes) -> dict[str, Any]:
+    """Returns the header of a file that the library has accepted: its length, 8 bytes, and JSON, perhaps with spaces behind it."""
+    return json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
 
 
 def network_header(file_format: str, config: StoredConfig, notes: dict[str, Any]) -> dict[str, str]:
@@ -119,13 +121,14 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
 
     Raises DataError when the file is not whole, is not of the expected format (made by `maker`), or holds NaN.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import SafetensorError
+    from safetensors.torch import load
 
     with reading(path):
-        try:
-            with safe_open(utf8_path(path, "safetensors"), "pt") as file:
-                header = file.metadata() or {}
-                tensors = {key: file.get_tensor(key) for key in file.keys()}
+        try:  # not the library's own opening: it maps the file, which not every network file system allows
+            content = path.read_bytes()
+            tensors = load(content)
+            header = _header(content).get("__metadata__") or {}
         except (SafetensorError, OSError) as error:
             raise DataError(f"{path}: not a complete safetensors file ({error})") from None
         whole = all(value.isfinite().all() for value in tensors.values())

@@ -53,7 +53,8 @@ def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
         widths = head[13:15] if head[8] < 2 else head[9:11]
         if widths != b"\x08\x08":
             raise DataError(f"{path}: the HDF5 file is damaged (lengths of {widths[1]} bytes); make or copy it again")
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        # private, as some network file systems share no maps
+        with mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ) as data:
             large = len(data) > 2 * _LOOKED_AT
             for start, end in [(0, _LOOKED_AT), (len(data) - _LOOKED_AT, len(data))] if large else [(0, len(data))]:
                 place = data.find(_HEAP, start, end)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib import font_manager
+from matplotlib import font_manager, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -64,6 +64,15 @@ def test_curves_leave_out_what_is_not_known(saved: list[Figure], tmp_path: Path)
 def test_a_log_without_numbers_is_drawn(saved: list[Figure], tmp_path: Path) -> None:
     draw_learning_curves([{"step": 1, "x": None}], [Panel("empty", [Curve("x", "x")])], tmp_path / "a.png", "step")
     assert not saved[0].axes[0].get_lines()
+
+
+def test_a_person_s_matplotlibrc_changes_no_picture(tmp_path: Path) -> None:
+    """Where there is no TeX, its first line ended the command."""
+    rows, panel = [{"step": n, "x": n} for n in (1, 2)], Panel("one", [Curve("x", "x")])
+    draw_learning_curves(rows, [panel], tmp_path / "plain.png", "step")
+    with rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "black", "savefig.bbox": "tight"}):
+        draw_learning_curves(rows, [panel], tmp_path / "own.png", "step")
+    assert (tmp_path / "own.png").read_bytes() == (tmp_path / "plain.png").read_bytes()
 
 
 def test_one_epoch_has_one_whole_tick(saved: list[Figure], tmp_path: Path) -> None:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import errno
+import mmap
 import os
 import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from dpcli.errors import DataError
+from dpcli.npy_files import map_npy
 from dpcli.prepare.scans.modelnet40 import read_labels
+from dpcli.runtime.weights import load_weights, save_weights
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.heap_check import check_heaps, trust_heaps
 from tests.support.prepare_helpers import ROOT
@@ -172,3 +178,23 @@ def test_what_this_process_made_is_searched_again_once_it_changed(tmp_path):
         file.write(b"\0")
     with pytest.raises(DataError, match="its heap of texts"):
         check_heaps(path)
+
+
+def test_a_file_system_that_shares_no_maps_is_no_reason_to_read_nothing(tmp_path, monkeypatch):
+    """As FUSE with direct_io and 9P without a cache, which know private maps alone; the library of weights has its own maps."""
+    array, weights, plain = np.arange(12, dtype=np.float32).reshape(4, 3), {"a": torch.eye(3)}, mmap.mmap
+    np.save(tmp_path / "a.npy", array)
+    save_weights(tmp_path / "w.safetensors", weights, {"format": "any", "names": "\u00fc"})
+    made = clouds(tmp_path / "c.h5")
+
+    def private(number: int, size: int, flags: int = mmap.MAP_SHARED, **options: int) -> mmap.mmap:
+        if options.get("access") != mmap.ACCESS_COPY and flags & mmap.MAP_SHARED:
+            raise OSError(errno.ENODEV, "No such device")
+        return plain(number, size, **options if "access" in options else {"flags": flags, **options})
+
+    monkeypatch.setattr(mmap, "mmap", private)
+    monkeypatch.setattr("safetensors.safe_open", Mock(side_effect=OSError("No such device (os error 19)")))
+    check_heaps(made)
+    assert np.array_equal(map_npy(tmp_path / "a.npy"), array)
+    tensors, header = load_weights(tmp_path / "w.safetensors", "any", "dpc")
+    assert tensors["a"].equal(weights["a"]) and header["names"] == "\u00fc"

@@ -13,7 +13,7 @@ from dpcli.draw.animation import write_pictures
 from dpcli.draw.fonts import text_font
 from dpcli.draw.palette import DARK, heat_colors
 from dpcli.draw.points import Raster, draw_dots
-from dpcli.draw.sheet import save_figure, save_picture, shortened, spread_evenly, write_line
+from dpcli.draw.sheet import new_figure, save_figure, save_picture, shortened, spread_evenly, write_line
 
 ANIMATIONS = (".gif", ".mp4")
 _CELL, _GAP, _TITLE, _MARGIN = 132, 3, 20, 58  # pixels: of a cell, between cells, of a title's line, left of the rows
@@ -118,11 +118,10 @@ def plane_picture(
     captions: dict[str, str],
 ) -> None:
     """Draws a panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
-    from matplotlib.figure import Figure
 
     present = sorted(set(labels[labels >= 0].tolist()))
     columns = -(-max(len(present), 1) // 22)
-    figure = Figure(figsize=(4.6 * len(coordinates) + 1.7 * columns, 4.9), layout="constrained")
+    figure = new_figure(4.6 * len(coordinates) + 1.7 * columns, 4.9)
     panels = figure.subplots(1, len(coordinates), squeeze=False)[0]
     names = [_short(label, class_names) for label in present]
     for axes, (stream, xy) in zip(panels, coordinates.items()):

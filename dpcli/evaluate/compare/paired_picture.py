@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 from dpcli.evaluate.compare.paired import Change, CompareReport, Paired
 from dpcli.evaluate.metric_titles import metric_title, title_of
 
@@ -15,7 +15,6 @@ _LETTERS_PER_INCH = 12  # of text at 9 points
 
 def draw_comparison(report: CompareReport, path: Path) -> None:
     """Draws differences with their intervals, one panel for each unit, and each sample in A against the same in B."""
-    from matplotlib.figure import Figure
 
     rows = {key: own for part in report.parts for key, own in part.changes.items()}
     panels = [
@@ -23,7 +22,7 @@ def draw_comparison(report: CompareReport, path: Path) -> None:
         for unit in dict.fromkeys(own.unit for own in rows.values())
     ]
     part = report.parts[0]
-    figure = Figure(figsize=(4 * (len(panels) + 1), 1.8 + 0.45 * max(5, *map(len, panels))), layout="constrained")
+    figure = new_figure(4 * (len(panels) + 1), 1.8 + 0.45 * max(5, *map(len, panels)))
     axes = figure.subplots(1, len(panels) + 1, squeeze=False)[0]
     for place, group in zip(axes, panels, strict=False):
         _differences_panel(place, group)

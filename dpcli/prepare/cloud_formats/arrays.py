@@ -241,7 +241,7 @@ def _refuse_axes_apart(path: Path, possible: Sequence[int], head: np.ndarray) ->
     """
     if len(head) < _TELLING or not np.abs(head).max() < _LARGEST:  # reading says that these are no coordinates
         return
-    values = np.memmap(path, "<f4", "r")
+    values = np.memmap(path, "<f4", "c")  # private, as some network file systems share no maps
     apart = {}
     for count in possible:
         parts = values.reshape(count, -1)

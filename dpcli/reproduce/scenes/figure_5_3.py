@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dpcli.draw.sheet import save_figure
+from dpcli.draw.sheet import new_figure, save_figure
 from dpcli.reproduce.runs import markdown, sweeps, write_text
 from dpcli.reproduce.scenes.table_5_2 import fit_all, mean_score, parser_of
 
@@ -46,10 +46,9 @@ def table(found: Found) -> str:
 
 def picture(found: Found, path: Path) -> None:
     """Draws a panel for each setting and score: every clip thin, the mean thick, the thesis's choice dashed."""
-    from matplotlib.figure import Figure
 
     settings = list(dict.fromkeys(setting for setting, _ in found))
-    figure = Figure(figsize=(3.2 * len(_SCORES), 3 * len(settings)), layout="constrained")
+    figure = new_figure(3.2 * len(_SCORES), 3 * len(settings))
     panels = figure.subplots(len(settings), len(_SCORES), squeeze=False)
     for row, setting in zip(panels, settings):
         values = [value for other, value in found if other == setting]
