@@ -1,4 +1,4 @@
-"""Kinet: a static stream, a dynamic stream on its frozen activations, and their fusion."""
+"""Kinet: a static stream (the thesis's spatial branch), a dynamic stream (its temporal branch) on its frozen activations, their fusion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The canonical Gaussians: their learned parameters, and how densifying and pruning change their number."""
+"""The canonical 3D Gaussians: their learned parameters, and how densification and pruning change their number."""
 
 from __future__ import annotations
 

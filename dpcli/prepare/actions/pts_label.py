@@ -56,13 +56,13 @@ class PtsLabel:
     """
 
     raw: Path
-    labels: int = 28
+    classes: int = 28
     lists: Path | None = None
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        if self.labels not in (14, 28):
-            raise UsageError(f"--labels {self.labels}: expected 14 or 28")
+        if self.classes not in (14, 28):
+            raise UsageError(f"--classes {self.classes}: expected 14 or 28")
 
     @property
     def class_names(self) -> list[str]:
@@ -71,8 +71,8 @@ class PtsLabel:
             return list(nvgesture.CLASS_NAMES)
         found = self._list_files()
         if found:
-            return gesture_names(found, self.labels)
-        return list(GESTURES) if self.labels == 14 else [f"{g}, {f}" for g in GESTURES for f in FINGERS]
+            return gesture_names(found, self.classes)
+        return list(GESTURES) if self.classes == 14 else [f"{g}, {f}" for g in GESTURES for f in FINGERS]
 
     @property
     def length_unit(self) -> str:
@@ -82,7 +82,7 @@ class PtsLabel:
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        return {"labels": self.labels}
+        return {"classes": self.classes}
 
     def _list_files(self) -> list[ListFile]:
         if self.lists is not None:
@@ -147,11 +147,11 @@ class PtsLabel:
             if match[1] not in listed:
                 return Item(match[1], path, problem=f"{path}: in neither list file, so its split is unknown")
             split, entry = listed[match[1]]
-            return Item(match[1], path, split, label=entry.label(self.labels), subject=subject)
+            return Item(match[1], path, split, label=entry.label(self.classes), subject=subject)
         if not (1 <= gesture <= len(GESTURES) and 1 <= finger <= len(FINGERS)):
             problem = f"{path}: gesture {gesture}, finger {finger} are out of range; expected 1 to 14 and 1 to 2"
             return Item(match[1], path, problem=problem)
-        label = gesture - 1 if self.labels == 14 else (gesture - 1) * len(FINGERS) + finger - 1
+        label = gesture - 1 if self.classes == 14 else (gesture - 1) * len(FINGERS) + finger - 1
         return Item(match[1], path, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

@@ -76,7 +76,7 @@ class Shrec17:
     """Reads SHREC'17; defaults are the peers' preprocessing without their thinning to 32 frames x 256 points."""
 
     raw: Path
-    labels: int = 28
+    classes: int = 28
     bbox: bool = True
     foreground: str = "component"  # component | none
     median: int = 3  # side of the median blur, pixels; 0 = none
@@ -86,7 +86,7 @@ class Shrec17:
 
     def __post_init__(self) -> None:
         for option, allowed in (
-            ("labels", (14, 28)),
+            ("classes", (14, 28)),
             ("foreground", ("component", "none")),
             ("median", (0, 3, 5)),
             ("coordinates", ("image", "camera")),
@@ -98,7 +98,7 @@ class Shrec17:
     @property
     def class_names(self) -> list[str]:
         """Returns the class names in the order of their labels."""
-        return gesture_names(find_lists(self.raw), self.labels)
+        return gesture_names(find_lists(self.raw), self.classes)
 
     @property
     def length_unit(self) -> str:
@@ -115,7 +115,8 @@ class Shrec17:
         lists = find_lists(self.raw)
         root = lists[0].path.parent
         items = {
-            item.name: item if item.problem else _with_folder_problem(item) for item in listed_items(lists, self.labels)
+            item.name: item if item.problem else _with_folder_problem(item)
+            for item in listed_items(lists, self.classes)
         }
         listed = {item.path for item in items.values()}
         for folder in sorted(root.glob("gesture_*/finger_*/subject_*/essai_*")):
