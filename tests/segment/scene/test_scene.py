@@ -284,7 +284,7 @@ def test_frames_too_far_apart_in_time_for_the_search_are_told(step, travel, warn
 
 
 def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
-    labels, said = explained(street(), most_objects=1)
+    labels, said = explained(street(), max_objects=1)
     assert "street: 1 moving objects besides the largest 1" in capsys.readouterr().err
     assert said.probability.shape[1] == 2 and set(np.unique(np.concatenate(labels))) == {0, 1}
     ids, counts = np.unique(street().part[np.concatenate(labels) == 1], return_counts=True)
