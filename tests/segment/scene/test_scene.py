@@ -321,6 +321,15 @@ def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
     assert look.up == "z" and look.gray == "0, stands" and shown.frame_offsets[1] == 0 < len(shown.points) == count
 
 
+def test_a_picture_tells_which_objects_are_too_far_away_for_it(capsys):
+    cloud = np.concatenate([street().frame(0), [[80, 0, 1], [3, 0, 1], [0, 90, 1]]])
+    part = np.zeros(len(cloud), int)
+    part[-3:] = 1, 2, 7
+    shown, _ = picture_of_scene(CloudSequence.from_frames("s", [cloud], part=[part]), "m")
+    assert np.unique(shown.part).tolist() == [-1, 2]
+    assert "s: the picture shows 30 m around the middle, and so not objects 1, 7" in capsys.readouterr().err
+
+
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
     frame = street().frame(0).astype(np.float64)
     tilt = level(np.array([0.17, 0.0, np.sqrt(1 - 0.17**2)]))
