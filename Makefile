@@ -239,7 +239,7 @@ figure-5.3: $(READY)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
 HELD_OUT := dpcli/reproduce/scenes/held_out_models.txt
-PRIOR ?= --set bfloat16=true
+PRIOR ?= --set amp=true
 needs-prior = $(call needs,MESHES,a folder with the models of $(HELD_OUT) and many others below it)
 prior: $(READY)
 	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)

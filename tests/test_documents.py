@@ -266,6 +266,17 @@ def test_a_term_is_where_the_table_says(term):
     assert [name for name in names if name not in known] == []
 
 
+def test_a_term_of_the_thesis_is_found_in_the_code_itself():
+    """One of a row's words is written where the row leads, so that a search through the code finds it, too."""
+    of_the_thesis = (ROOT / "docs" / "glossary.md").read_text().partition("\n## Words of the thesis")[2]
+    rows = {term: files for term, (files, _) in where_is().items() if f"\n| {term} |" in of_the_thesis}
+    assert len(rows) > 35
+    for term, files in rows.items():
+        code = " ".join(" ".join((ROOT / "dpcli" / file).read_text() for file in files).lower().split())
+        words = [re.sub(r" [A-Zβτα]$", "", word.strip()).lower() for word in re.split(r"[,;()]|`[^`]*`", term)]
+        assert any(word in code for word in words if word and not word.startswith("equation")), term
+
+
 # Terms of the field, and the word by which a stranger looks for each.
 TERMS = {
     "surface solver": "surface",

@@ -94,7 +94,7 @@ def means_of_samples(values: Mapping[str, np.ndarray]) -> WeightedMetric:
 def drawn_counts(
     samples: int, resamples: int, rng: np.random.Generator
 ) -> Iterator[np.ndarray]:  # f64 (R,samples), blocks of rows
-    """Draws `samples` samples with replacement, `resamples` times, and yields how often each was drawn, block by block."""
+    """Draws `samples` samples with replacement, `resamples` times, and yields how often each was, blocks f64 (b,samples)."""
     rows = max(1, _BLOCK // max(samples, 1))
     for start in range(0, resamples, rows):
         count = min(rows, resamples - start)

@@ -37,7 +37,7 @@ class FitConfig:
     )
     start_radius: float = setting(0.5, "Radius of the sphere of start = sphere, scene units.", above=0)
     gaussians: int = setting(4096, "Gaussians at the start.", least=16)
-    most_gaussians: int = setting(
+    max_gaussians: int = setting(
         80_000, "Gaussians at most; a number below `gaussians` also lowers those at the start.", least=16
     )
     parts: int = setting(8, "Rigid parts at most; the fit itself blends the motions of 8 at most.", least=1, most=1000)
@@ -122,9 +122,9 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         check(self)
-        if self.most_gaussians < self.gaussians:
+        if self.max_gaussians < self.gaussians:
             raise UsageError(
-                f"most_gaussians = {self.most_gaussians}: expected at least the {self.gaussians} of the start (gaussians)"
+                f"max_gaussians = {self.max_gaussians}: expected at least the {self.gaussians} of the start (gaussians)"
             )
 
     @property
@@ -171,7 +171,7 @@ _QUICK = FitConfig(
     sparse_steps=2000,
     batch=2,
     gaussians=6000,
-    most_gaussians=12_000,
+    max_gaussians=12_000,
     parts=16,
     width=96,
     depth=4,
@@ -189,7 +189,7 @@ FIT_PRESETS = {
         dense_steps=40,
         sparse_steps=460,
         gaussians=5000,
-        most_gaussians=8000,
+        max_gaussians=8000,
         rate_mean=(2e-3, 5e-4),
         rate_network=(3e-3, 3e-4),
         rate_rigid=3e-3,
@@ -200,7 +200,7 @@ FIT_PRESETS = {
         sparse_steps=20,
         batch=1,
         gaussians=300,
-        most_gaussians=400,
+        max_gaussians=400,
         width=16,
         depth=2,
         parts=3,
@@ -223,8 +223,8 @@ def resolve_settings(given: Given) -> tuple[FitConfig, Supervision]:
     A limit below the number of Gaussians that the preset starts with lowers that number, unless it was given too.
     """
     base, values = dict(PRESETS[given.preset or "quick"]), given.values
-    if "most_gaussians" in values and "gaussians" not in values:
-        base["fit"] = replace(base["fit"], gaussians=min(base["fit"].gaussians, values["most_gaussians"]))
+    if "max_gaussians" in values and "gaussians" not in values:
+        base["fit"] = replace(base["fit"], gaussians=min(base["fit"].gaussians, values["max_gaussians"]))
     resolved = CATALOG.resolve(base, given)
     return resolved["fit"], resolved["supervision"]
 

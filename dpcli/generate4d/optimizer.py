@@ -1,4 +1,4 @@
-"""The optimization of a 4D scene: what one step draws, which losses it adds, and how the Gaussians grow in number.
+"""The dense-to-sparse optimization of a 4D scene: what one step draws, which losses it adds, and how the Gaussians grow in number.
 
 What a step draws depends on (seed, step) alone, so an optimization that was saved and restored takes the same steps.
 """
@@ -205,7 +205,7 @@ class SceneOptimizer:
         return torch.where(black, torch.zeros(1, 3), torch.ones(1, 3)).to(self.device)
 
     def _motion_terms(self, instant: Instant, frames: list[int]) -> Tensor:
-        """Returns the losses on what carries the Gaussians: parts, the drift of control points, shape over time."""
+        """Returns the losses on what carries the Gaussians: parts, control points (C.13), shape over time."""
         config, motion, carriers = self.config, instant.motion, instant.carriers
         total = torch.zeros((), device=self.device)
         chosen = _thin(len(carriers))

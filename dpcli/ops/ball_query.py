@@ -1,4 +1,4 @@
-"""Space-time ball query: neighbors within a radius that depends on the distance in time (thesis 3.3, Kinet)."""
+"""Space-time ball query: space-time neighbors, those within a radius that depends on the distance in time (thesis 3.3, Kinet)."""
 
 from __future__ import annotations
 

@@ -99,8 +99,8 @@ def _legend(draw: Any, top: int, right: int, part: np.ndarray, gray: str) -> int
     ids, counts = np.unique(part, return_counts=True)
     font, start, left = text_font(11), right // 2, right
     for own, count in reversed(list(zip(ids.tolist(), counts.tolist(), strict=True))):
-        percent = round(100 * count / len(part))
-        text = f"{gray if own < 0 else own}: {percent or '<1'} %"
+        percent = round(100 * count / len(part)) or "<1"
+        text = f"{gray if own < 0 else own}: {'>99' if percent == 100 and len(ids) > 1 else percent} %"
         width = int(draw.textlength(text, font=font)) + 20
         if left - width < start:
             draw.text((left - 14, top + 4), "…", fill=LIGHT.ink, font=font)

@@ -34,10 +34,10 @@ def test_what_is_given_stands_over_the_preset():
 
 
 def test_a_limit_on_gaussians_holds_from_the_start():
-    assert resolve("most_gaussians=800").gaussians == 800
-    assert resolve("most_gaussians=9000").gaussians == 6000
-    with pytest.raises(UsageError, match="most_gaussians = 800: expected at least the 900"):
-        resolve("most_gaussians=800", "gaussians=900")
+    assert resolve("max_gaussians=800").gaussians == 800
+    assert resolve("max_gaussians=9000").gaussians == 6000
+    with pytest.raises(UsageError, match="max_gaussians = 800: expected at least the 900"):
+        resolve("max_gaussians=800", "gaussians=900")
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_what_nothing_reads_is_told(words, says):
         ("parts=0", "parts = 0: expected at least 1"),
         ("start=cube", "start = cube: expected one of auto, sphere, inflate, hull"),
         ("partition=none", "partition = none: expected one of static, time"),
-        ("most_gaussians=5", "most_gaussians = 5: expected at least 16"),
+        ("max_gaussians=5", "max_gaussians = 5: expected at least 16"),
         ("rate_mean=0,1", "rate_mean = 0,1: expected numbers, each above 0"),
         ("prior=magic", "prior = magic: expected one of auto, none, inflated, network, views, zero123"),
         ("speed=3", "unknown setting speed"),

@@ -74,7 +74,8 @@ def test_the_legend_names_what_stands_and_what_has_few_points() -> None:
         text=lambda place, text, **_look: told.append(text),
     )
     _legend(draw, 0, 800, np.repeat([-1, 1, 2], [700, 298, 2]), "0, stands")
-    assert told == ["2: <1 %", "1: 30 %", "0, stands: 70 %"]
+    _legend(draw, 0, 800, np.repeat([0, 1], [999, 1]), "?")
+    assert told == ["2: <1 %", "1: 30 %", "0, stands: 70 %", "1: <1 %", "0: >99 %"]
 
 
 def test_turntable(sequence: CloudSequence, tmp_path: Path) -> None:

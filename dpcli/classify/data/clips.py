@@ -279,7 +279,7 @@ def check_columns(reader: CloudsReader | OneVideo, config: KinetConfig) -> None:
 
 
 def sample_points(frame: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns `count` points of a frame in random order, drawn without replacement, or whole copies and a random remainder if it has fewer.
+    """Returns `count` points of a frame (N,3+F) in random order, drawn without replacement; of fewer, whole copies and some more.
 
     An empty frame gives `count` points at the origin.
     """

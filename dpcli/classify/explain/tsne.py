@@ -99,7 +99,7 @@ def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
 
 
 def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBORS) -> float | None:
-    """Returns the share of the labeled videos whose k nearest other labeled ones vote for their class; None where it says nothing.
+    """Returns the share of the labeled videos (S,D) whose k nearest other labeled ones vote for their class; None where it says nothing.
 
     Euclidean distances in float64, ties to the lower index; a tied vote goes to the tied class with the nearest member.
     Fewer than k+1 videos: all others vote. None with fewer than two videos or classes.

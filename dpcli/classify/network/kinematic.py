@@ -1,8 +1,8 @@
 """The dynamic stream: kinematic learning units that fit space-time surfaces to a frozen static network's activations.
 
 A unit (thesis figure 3.4) reduces the features of a neighborhood, splits them into groups, fits one surface a group with
-weights from the previous unit's deviations, and hands on the normals. `Kinematics` runs the units; how their normals
-become one feature per centroid is the business of `merge`.
+weights from the previous unit's deviations, and hands on the normals. `Kinematics` runs one unit after another, the
+thesis's iterative normal refinement; how their normals become one feature per centroid is the business of `merge`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dpcli.ops import gather_points
 
 
 class DeviationWeights(nn.Module):
-    """Computes logits of neighbor weights from deviations by one linear map over groups (eq. 3.8)."""
+    """Computes the logits of weighted neighbors from deviations, by one linear map over groups (eq. 3.8)."""
 
     def __init__(self, previous: int, groups: int) -> None:
         super().__init__()

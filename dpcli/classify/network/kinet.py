@@ -1,4 +1,4 @@
-"""Kinet: a static stream, a dynamic stream on its frozen activations, and their fusion."""
+"""Kinet: a static stream (the thesis's spatial branch), a dynamic stream (its temporal branch) on its frozen activations, their fusion."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Kinet(nn.Module):
 
 
 def fuse(static: Tensor, dynamic: Tensor, rule: str) -> Tensor:
-    """Returns the class probabilities of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
+    """Returns the probabilities (B,C) of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
     if rule == "logits":
         return torch.softmax((static + dynamic) / 2, -1)
     return (torch.softmax(static, -1) + torch.softmax(dynamic, -1)) / 2

@@ -1,7 +1,7 @@
-"""The space-time surface: weighted least-squares fit of A f + b = t over a neighborhood, its normal, and the deviations.
+"""The space-time surface (ST-surface): weighted least-squares fit of A f + b = t, its normal (ST-normal), and the deviations.
 
-Equations 3.4-3.7 of the thesis, for K groups of d features at once. Everything is differentiable, batched over leading
-dimensions, and free of parameters. n counts neighbors; times are in frames.
+Equations 3.4 to 3.7 of the thesis: the tangent hyperplane over a neighborhood, for K groups of d features at once. Everything
+is differentiable, batched over leading dimensions, and free of parameters. n counts neighbors; times are in frames.
 
 A network calls `fit_reduced` of `st_surface_cpu.py`, which reduces its features and then fits by `fit_surface` and
 `deviations` of this module; on a CPU by kernels instead (`ops/cpu`), with the same numbers.

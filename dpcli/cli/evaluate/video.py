@@ -41,8 +41,8 @@ class ProtocolOptions:
     fvd: Annotated[
         str | None, word_option("--fvd", FVD_VARIANTS, "Published variant of FVD. Default: the protocol's.")
     ] = None
-    every: Annotated[
-        int, typer.Option("--every", min=1, help="Frames between the starts of two windows of FVD and FID-VID.")
+    hop: Annotated[
+        int, typer.Option("--hop", min=1, help="Frames between the starts of two windows of FVD and FID-VID.")
     ] = 1
 
 
@@ -81,7 +81,7 @@ def video(
     from dpcli.evaluate.commands.video import run_video
     from dpcli.evaluate.video.protocol import check_choices_of, video_protocol
 
-    asked, networks = parse_video_metrics(metrics), {"lpips": choices.lpips, "fvd": choices.fvd, "every": choices.every}
+    asked, networks = parse_video_metrics(metrics), {"lpips": choices.lpips, "fvd": choices.fvd, "hop": choices.hop}
     check_choices_of(asked, choices.background, **networks)
     result = run_video(
         predicted,

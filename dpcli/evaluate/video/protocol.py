@@ -25,7 +25,7 @@ SMALLEST = {"ssim": 11, "ms_ssim": 176}  # pixels a side
 
 @dataclass(frozen=True)
 class Networks:
-    """Says which published network stands for a metric. every: windows of FVD and FID-VID start at each so many frames.
+    """Says which published network stands for a metric. hop: windows of FVD and FID-VID start at each so many frames.
 
     lpips_range01: LPIPS gets colors in 0..1 where it expects -1..1, as DisCo's evaluation does.
     """
@@ -34,7 +34,7 @@ class Networks:
     lpips_range01: bool = False
     fvd: str = "consistent4d"
     clip: str = "openai"
-    every: int = 1
+    hop: int = 1
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ PROTOCOLS = {
 
 
 def video_protocol(
-    name: str, background: str | None = None, *, lpips: str | None = None, fvd: str | None = None, every: int = 1
+    name: str, background: str | None = None, *, lpips: str | None = None, fvd: str | None = None, hop: int = 1
 ) -> VideoProtocol:
     """Returns a protocol by its name, over another background or with other networks when they are given.
 
-    lpips: alex | vgg | squeeze; fvd: a variant of `frechet/variants.py`; every: its windows start each so many
+    lpips: alex | vgg | squeeze; fvd: a variant of `frechet/variants.py`; hop: its windows start each so many
     frames. Raises UsageError for names there aren't.
     """
     if name not in PROTOCOLS:
@@ -102,7 +102,7 @@ def video_protocol(
             raise UsageError(f"--{option} {value}: expected {', '.join(known)}")
     found = PROTOCOLS[name]
     given = {"lpips": lpips, "fvd": fvd}
-    networks = replace(found.networks, every=every, **{key: value for key, value in given.items() if value})
+    networks = replace(found.networks, hop=hop, **{key: value for key, value in given.items() if value})
     return replace(found, networks=networks, background=background or found.background)
 
 
@@ -113,14 +113,14 @@ def check_picture_of(metrics: Sequence[str] | None, picture: object) -> None:
 
 
 def check_choices_of(
-    metrics: Sequence[str] | None, background: str | None, *, lpips: str | None, fvd: str | None, every: int
+    metrics: Sequence[str] | None, background: str | None, *, lpips: str | None, fvd: str | None, hop: int
 ) -> None:
     """Raises UsageError for a choice, as in `video_protocol`, that none of the metrics depends on; None: the default ones."""
     asked = set(metrics or PICTURE_METRICS)
     for option, given, readers in (
         ("--lpips", lpips is not None, ("lpips",)),
         ("--fvd", fvd is not None, ("fvd",)),
-        ("--every", every != 1, FRECHET_METRICS),
+        ("--hop", hop != 1, FRECHET_METRICS),
     ):
         if given and not asked & set(readers):
             raise UsageError(f"{option} is of {', '.join(readers)}: name it in --metrics, too, or leave {option} out")

@@ -1,4 +1,4 @@
-"""Score distillation sampling (SDS, Poole et al. 2022) from Zero123, which knows an object from another camera.
+"""Score distillation sampling (SDS, Poole et al. 2022) from Zero123, a view-conditioned diffusion model.
 
 Equation C.11 of the thesis: the gradient w(t) (eps_hat(z_t; reference, camera, t) - eps) flows through the VAE's encoder
 into the render. Where the thesis is silent the settings are those of SC4D (Wu et al. 2024): guidance 5,

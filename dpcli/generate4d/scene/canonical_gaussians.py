@@ -1,4 +1,4 @@
-"""The canonical Gaussians: their learned parameters, and how densifying and pruning change their number."""
+"""The canonical 3D Gaussians: their learned parameters, and how densification and pruning change their number."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class CanonicalGaussians(nn.Module):
     def _choose_to_grow(self, keep: Tensor, config: FitConfig) -> Tensor:  # [N] -> [N]
         """Returns which of the Gaussians to keep are copied: those of the largest mean screen gradient, as room allows."""
         chosen = torch.zeros_like(keep)
-        room = min(int(config.grow_share * len(self)), config.most_gaussians - int(keep.sum()))
+        room = min(int(config.grow_share * len(self)), config.max_gaussians - int(keep.sum()))
         if room > 0:
             gradient = self.gradient / self.seen.clamp(min=1)
             best = torch.where(keep, gradient, torch.zeros_like(gradient)).topk(min(room, len(self)), sorted=True)

@@ -34,7 +34,7 @@ class ControlPoints(nn.Module):
         return knn(points.detach()[None], self.position.detach()[None], self.neighbors)[1][0]
 
     def weights(self, points: Tensor, nearest: Tensor) -> Tensor:  # [N, k]
-        """Returns omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
+        """Returns the weighting ratio omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far away."""
         controls = torch.cat([self.position, self.log_radius[:, None]], -1)
         near = gather_points(controls[None], nearest[None])[0]
         squared = (points[:, None] - near[..., :3]).square().sum(-1)

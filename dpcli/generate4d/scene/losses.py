@@ -16,7 +16,10 @@ def picture_loss(
     background: Tensor,  # [C, 3]
     foreground: float,
 ) -> Tensor:
-    """Returns the mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
+    """Returns the reconstruction loss (C.8 to C.10), mean squared errors.
+
+    They are that of colors on a background plus `foreground` times that of the silhouette (the foreground loss).
+    """
     truth = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
     return (rendered - truth).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
 

@@ -1,4 +1,4 @@
-"""The whole 4D model (eq. 5.2): canonical Gaussians, the motion field, and from the sparse stage on the control points."""
+"""The whole 4D model (deformation function, eq. 5.2): canonical Gaussians, motion field, in the sparse stage control points."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def encode(
     values: Tensor,  # [..., D]
     frequencies: int,
 ) -> Tensor:  # [..., 2 * D * frequencies]
-    """Returns sine and cosine of the values times 1, 2, 4, ... (Mildenhall et al. 2020), without the values themselves.
+    """Returns the positional embedding (Mildenhall et al. 2020): sine and cosine of the values times 1, 2, 4, ..., without these.
 
     >>> encode(torch.tensor([0.0]), 2).tolist()
     [0.0, 0.0, 1.0, 1.0]
@@ -115,7 +115,7 @@ class MotionField(nn.Module):
         self.center.copy_(share.T @ points / share.sum(0)[:, None].clamp(min=1e-6))
 
     def part_of(self, points: Tensor, times: Tensor) -> Tensor:  # [B, N, S]
-        """Returns m, the part probabilities of canonical points (N,3) at times (B) in 0..1."""
+        """Returns the part mask m, a probability of each part, of canonical points (N,3) at times (B) in 0..1."""
         code = encode(points, _POINT_FREQUENCIES)
         if self.by_time:
             code = _join_codes(code, encode(times[:, None], _TIME_FREQUENCIES))
@@ -157,7 +157,7 @@ def blend_motions(
     turn: Tensor,  # [..., 4]
     weight: Tensor,  # [..., 1] w, 0..1
 ) -> tuple[Tensor, Tensor]:  # [..., 3], [..., 4]
-    """Returns the displacement w (R x + t - x) + (1 - w) d, eq. 5.6, and the unit quaternion blended likewise.
+    """Returns the weighted fusion w (R x + t - x) + (1 - w) d, eq. 5.6, and the unit quaternion blended likewise.
 
     The thesis writes R x + t, a position, in place of the displacement. Quaternions must lie in one hemisphere.
     """
@@ -167,7 +167,7 @@ def blend_motions(
 
 
 def add_motions(rigid: Tensor, rigid_turn: Tensor, rest: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the sum of both displacements (...,3), eq. 5.5, and the product of both turns (...,4), w >= 0."""
+    """Returns the motion decomposition, eq. 5.5: the sum of both displacements (...,3), the product of both turns (...,4), w >= 0."""
     both = multiply_quaternions(turn, rigid_turn)
     return rigid + rest, torch.where(both[..., :1] < 0, -both, both)
 

@@ -36,7 +36,7 @@ _FORMS = ("auto", "msraction3d", "ntu60", "pts_label")
 def open_preprocessed(
     raw: Path,
     form: str = "auto",
-    labels: int = 28,
+    classes: int = 28,
     lists: Path | None = None,
     protocol: str = "xsub",
     scale: float | None = None,
@@ -53,7 +53,7 @@ def open_preprocessed(
     if form == "pts_label":
         if scale is not None:
             raise UsageError("--scale: pts_label.npy holds pixels, which are kept; leave it out")
-        return PtsLabel(raw, labels, lists)
+        return PtsLabel(raw, classes, lists)
     if lists is not None:
         raise UsageError(f"--lists: the names of {form}'s files give label and split; leave it out")
     return PeerClouds(raw, form, protocol, scale)

@@ -56,12 +56,12 @@ class PtsLabel(Reader):
     """
 
     raw: Path
-    labels: int = 28
+    classes: int = 28
     lists: Path | None = None
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        require_known(self, labels=(14, 28))
+        require_known(self, classes=(14, 28))
 
     @property
     def class_names(self) -> list[str]:
@@ -69,8 +69,8 @@ class PtsLabel(Reader):
             return list(nvgesture.CLASS_NAMES)
         found = self._list_files()
         if found:
-            return gesture_names(found, self.labels)
-        return list(GESTURES) if self.labels == 14 else [f"{g}, {f}" for g in GESTURES for f in FINGERS]
+            return gesture_names(found, self.classes)
+        return list(GESTURES) if self.classes == 14 else [f"{g}, {f}" for g in GESTURES for f in FINGERS]
 
     @property
     def length_unit(self) -> str:
@@ -78,7 +78,7 @@ class PtsLabel(Reader):
 
     @property
     def config(self) -> dict[str, Any]:
-        return {"labels": self.labels}
+        return {"classes": self.classes}
 
     def _list_files(self) -> list[ListFile]:
         if self.lists is not None:
@@ -142,11 +142,11 @@ class PtsLabel(Reader):
             if match[1] not in listed:
                 return Item(match[1], path, problem=f"{path}: in neither list file, so its split is unknown")
             split, entry = listed[match[1]]
-            return Item(match[1], path, split, label=entry.label(self.labels), subject=subject)
+            return Item(match[1], path, split, label=entry.label(self.classes), subject=subject)
         if not (1 <= gesture <= len(GESTURES) and 1 <= finger <= len(FINGERS)):
             problem = f"{path}: gesture {gesture}, finger {finger} are out of range; expected 1 to 14 and 1 to 2"
             return Item(match[1], path, problem=problem)
-        label = gesture - 1 if self.labels == 14 else (gesture - 1) * len(FINGERS) + finger - 1
+        label = gesture - 1 if self.classes == 14 else (gesture - 1) * len(FINGERS) + finger - 1
         return Item(match[1], path, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

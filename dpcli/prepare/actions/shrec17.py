@@ -76,7 +76,7 @@ class Shrec17(Reader):
     """Reads SHREC'17; defaults are the peers' preprocessing without their thinning to 32 frames x 256 points."""
 
     raw: Path
-    labels: int = 28
+    classes: int = 28
     bbox: bool = True
     foreground: str = "component"  # component | none
     median: int = 3  # side of the median blur, pixels; 0 = none
@@ -85,12 +85,12 @@ class Shrec17(Reader):
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
-        require_known(self, labels=(14, 28), foreground=("component", "none"), median=(0, 3, 5))
+        require_known(self, classes=(14, 28), foreground=("component", "none"), median=(0, 3, 5))
         require_known(self, coordinates=("image", "camera"))
 
     @property
     def class_names(self) -> list[str]:
-        return gesture_names(find_lists(self.raw), self.labels)
+        return gesture_names(find_lists(self.raw), self.classes)
 
     @property
     def length_unit(self) -> str:
@@ -100,7 +100,8 @@ class Shrec17(Reader):
         lists = find_lists(self.raw)
         root = lists[0].path.parent
         items = {
-            item.name: item if item.problem else _with_folder_problem(item) for item in listed_items(lists, self.labels)
+            item.name: item if item.problem else _with_folder_problem(item)
+            for item in listed_items(lists, self.classes)
         }
         listed = {item.path for item in items.values()}
         for folder in sorted(root.glob("gesture_*/finger_*/subject_*/essai_*")):

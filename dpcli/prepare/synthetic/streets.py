@@ -30,7 +30,7 @@ class SyntheticStreets(Reader):
     frames: int = 4
     rows: int = 64
     movers: int = 6
-    rate: float = 10.0
+    fps: float = 10.0
     speed: float = 12.0
     noise: float = 0.02
     dropout: float = 0.05
@@ -42,8 +42,8 @@ class SyntheticStreets(Reader):
         require_least(self, streets=1, frames=1, movers=0)
         if self.rows not in LIDARS:
             raise UsageError(f"--rows {self.rows}: expected {', '.join(map(str, LIDARS))}")
-        if not (self.rate > 0 and 0 <= self.dropout < 1 and self.noise >= 0 and self.speed >= 0):
-            raise UsageError("--rate must be above 0, --dropout in 0..1, --noise and --speed 0 or more")
+        if not (self.fps > 0 and 0 <= self.dropout < 1 and self.noise >= 0 and self.speed >= 0):
+            raise UsageError("--fps must be above 0, --dropout in 0..1, --noise and --speed 0 or more")
 
     def items(self) -> list[Item]:
         return [Item(f"street_{number:04}", Path("street"), split="test") for number in range(self.streets)]
@@ -52,7 +52,7 @@ class SyntheticStreets(Reader):
         standing, lidar = standing_street(rng), LIDARS[self.rows]
         movers = draw_movers(int(rng.integers(min(1, self.movers), self.movers + 1)), rng)
         drive = (np.array([0, -_LANE]), rng.normal(0, 0.05), rng.uniform(0, self.speed), rng.normal(0, 0.05))
-        times = np.arange(self.frames) / self.rate
+        times = np.arange(self.frames) / self.fps
         clouds, parts, poses = [], [], []
         for time in times:
             to_lidar = np.linalg.inv(planar_pose(*drive, time))

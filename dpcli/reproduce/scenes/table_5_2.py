@@ -52,7 +52,7 @@ def score(views: Path, name: str, settings: Sequence[str], given: argparse.Names
     prior = "" if given.prior == "views" else given.prior
     scene = given.out / f"{views.stem}{name}{prior}seed{given.seed}.h5"
     dense, sparse = given.steps
-    settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "most_gaussians=6000", *settings]
+    settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "max_gaussians=6000", *settings]
     words = [word for value in settings for word in ("--set", value)]
     words = ["--preset", "quick", "--prior", given.prior, "--seed", given.seed, *words]
 

@@ -1,4 +1,4 @@
-"""`dpc segment estimate-flow`: the scene flow of every frame, as a field of a clouds file or as its points (thesis A.1.5)."""
+"""`dpc segment estimate-flow`: the scene flow of every frame, as a field of a clouds file or as points (flow-based framework, A.1.5)."""
 
 from __future__ import annotations
 

@@ -235,7 +235,7 @@ def _check_multibody(settings: MultibodySettings, reader: CloudsReader, by_track
     if "flexible" in changed and not by_tracks:
         why = "--flow icp uses none" if "track" in reader.fields else f"{reader.path} has no field track"
         raise UsageError(f"flexible = {settings.flexible:g}: it belongs to tracks, and {why}; leave it out")
-    unread = [name for name in changed if name not in ("flexible", "most_bodies")]
+    unread = [name for name in changed if name not in ("flexible", "max_bodies")]
     if by_tracks and unread:
         log.warn(f"{', '.join(unread)}: not read where points have tracks; --flow icp searches by places instead")
 

@@ -116,7 +116,7 @@ class Search:
 
     def _grow(self, found: Explanation) -> Explanation:
         """Returns the explanation with further bodies, as long as the energy falls."""
-        while len(found.bodies) < self.settings.most_bodies:
+        while len(found.bodies) < self.settings.max_bodies:
             tried = list(self.map(partial(self._with, found), self._most_promising(found)))
             if not tried:
                 break

@@ -35,7 +35,7 @@ class MultibodySegmenter(Segmenter):
     @property
     def slots(self) -> int:
         """Returns the most bodies of a sequence."""
-        return self.settings.most_bodies
+        return self.settings.max_bodies
 
     def explain(
         self,

@@ -14,7 +14,7 @@ class MultibodySettings:
     Costs are in units of one point whose residuals are all at their worst.
     """
 
-    most_bodies: int = setting(24, "multibody: bodies of a sequence at most.", least=1)
+    max_bodies: int = setting(24, "multibody: bodies of a sequence at most.", least=1)
     body_price: float = setting(
         0.001,
         "multibody: cost of a further body, as a share of all points; between two frames, at least 9 points.",

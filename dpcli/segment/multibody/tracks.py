@@ -176,7 +176,7 @@ def parts_of_tracks(tracks: Tracks, settings: MultibodySettings) -> np.ndarray:
     order = [first, *(t for t in range(len(tracks.places)) if t != first)]
     weights = np.where(tracks.shown[order], 1.0, _GUESSED)
     options = {"patches": _PATCHES, "softness": settings.flexible / _SOFT, "weights": weights}
-    part = find_parts(tracks.places[order], tracks.shown[first], settings.most_bodies, **options)
+    part = find_parts(tracks.places[order], tracks.shown[first], settings.max_bodies, **options)
     part = _join_again(tracks, _choose_again(tracks, part, first, settings.flexible), first, settings.flexible)
     order = np.argsort(-np.bincount(part), kind="stable")
     return np.argsort(order)[part]

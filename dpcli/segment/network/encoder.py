@@ -25,7 +25,7 @@ class Level:
 
 
 class InvariantPooling(nn.Module):
-    """Pools over the group: u(p) = sum_a softmax_a(logit(p,a)) f(p,a) (eq. 4.2), with one or several weightings.
+    """Pools over the group: u(p) = sum_a softmax_a(logit(p,a)) f(p,a) (eq. 4.2), the sum by a selection probability or several.
 
     logit = 1x1 convolution of [f(p,a), R_a^T (x_p - m)]. m is the cloud's mean in the release, which lets a part's
     weights depend on the other parts' poses; else the mean of the point's own neighbors. `global`: one weighting for
@@ -60,7 +60,7 @@ def _turned_back(rotations: Tensor, offsets: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Stacks blocks of separable SE(3) convolutions: the features of every point under all rotations (eq. 4.1).
+    """Extracts per-point features under all rotations (eq. 4.1) by blocks of separable SE(3) convolutions (EPN).
 
     The first layer's centers are farthest points; later strides keep the first of them.
     """

@@ -1,4 +1,4 @@
-"""The 60 rotations of the icosahedron, made from two of them, and the index tables a group convolution needs.
+"""The icosahedron's 60 rotations, a rotation group, made from two of them, and the index tables a group convolution needs.
 
 Convention: a feature f(x, a) belongs to point x and rotation R_a. Turning the cloud by a group element g gives
 f'(g x, g a) = f(x, a) (thesis 4.4.1): features move to other points *and* other group elements, nothing else.

@@ -16,7 +16,7 @@ from dpcli.segment.network.icosahedron import GROUPS, RotationGroup
 
 
 def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Tensor]:
-    """Returns, for T (...,3,3), label i64 (...,G) and residual (...,G,3,3) of every rotation a of the group.
+    """Returns, for T (...,3,3), the anchor's label i64 (...,G) and the residual (...,G,3,3) of every rotation a of the group.
 
     l(a) = argmax_l trace(R_a^T T R_l); the residual is R_a^T T R_l.
     """
@@ -45,7 +45,7 @@ class MotionHead(nn.Module):
             self.residual.bias.copy_(torch.tensor([1.0, 0, 0, 0]))  # start from no residual
 
     def part_features(self, features: Tensor, points: Tensor, mask: Tensor) -> Tensor:
-        """Returns the features (B,S,G,D) of each part by eq. 4.3, the maximum over its points.
+        """Returns the part-level equivariant features (B,S,G,D) of eq. 4.3, the maximum over its points.
 
         features (B,P,G,C), points (B,P,3), mask (B,P,S). Coordinates are centered on the part, weighted by the mask, so
         that they depend on nothing but the part.
@@ -105,10 +105,10 @@ def rotation_loss(
 def choose_motion(
     rotations: Tensor, first: Tensor, mask1: Tensor, second: Tensor, mask2: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns, of candidate rotations (B,S,M,3,3), the one with the least two-way Chamfer distance (B.6, B.7).
+    """Returns, of candidate rotations (B,S,M,3,3), the one with the least part-level distance (B.6, B.7).
 
-    The distance is weighted by the masks. first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1.
-    The translation joins the parts' weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
+    The distance is a two-way Chamfer distance, weighted by the masks. first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S)
+    matched to mask1. The translation joins the parts' weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
     """
     share1, share2 = (m / m.sum(1, keepdim=True).clamp(min=1e-6) for m in (mask1, mask2))
     center1, center2 = torch.einsum("bps,bpi->bsi", share1, first), torch.einsum("bps,bpi->bsi", share2, second)

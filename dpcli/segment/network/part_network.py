@@ -16,7 +16,7 @@ from dpcli.segment.network.segmentation_head import SegmentationHead
 
 @dataclass
 class FrameParts:
-    """Holds masks (B,N,S) of single frames and the coarsest level, which the motion head reads."""
+    """Holds soft rigid masks (B,N,S) of single frames and the coarsest level, which the motion head reads."""
 
     mask: Tensor
     level: Level

@@ -1,4 +1,4 @@
-"""Ego motion: the sensor's own motion between frames, by point-to-plane ICP on what stands."""
+"""Ego-motion: the sensor's own motion between frames, by point-to-plane ICP on what stands."""
 
 from __future__ import annotations
 

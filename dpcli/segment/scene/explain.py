@@ -66,7 +66,7 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
     eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
     world, own, turn, apart, ground_seen = _build_world(shown, eye, settings)
     every = find_moving_objects(world, settings)
-    found = every[: settings.most_objects]
+    found = every[: settings.max_objects]
     for number, one in enumerate(found, 1):
         for t, points in one.points.items():
             labels[filled[t]][points] = number

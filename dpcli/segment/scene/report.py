@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.counted import counted
+from dpcli.runtime.progress import log
 from dpcli.segment.pictures import Look
 from dpcli.segment.scene.explain import SENSOR_NEAR
 from dpcli.segment.scene.ground import find_up
@@ -70,12 +71,24 @@ def _same(sequence: CloudSequence, first: int, second: int) -> bool:
     return np.array_equal(sequence.frame(first), sequence.frame(second))
 
 
+def _names(objects: list[int]) -> str:
+    more = f" and {len(objects) - _NAMED} more" if len(objects) > _NAMED else ""
+    return f"object{'s' if len(objects) > 1 else ''} {', '.join(map(str, objects[:_NAMED]))}{more}"
+
+
 def picture_of_scene(sequence: CloudSequence, length_unit: str) -> tuple[CloudSequence, Look]:
-    """Returns what a picture shows of a scene, what stands without a color, and from where: obliquely from above."""
+    """Returns what a picture shows of a scene, what stands without a color, and from where: obliquely from above.
+
+    A message names the objects that are so far away that the picture doesn't show them.
+    """
     sequence.points = sequence.points * np.float32(METERS.get(length_unit, 1.0))
     middle = np.median(sequence.points, axis=0)
     reach = np.linalg.norm(sequence.points - middle, axis=1)
-    shown = np.flatnonzero(reach <= max(_SHOWN, float(np.percentile(reach, 20))))
+    farthest = max(_SHOWN, float(np.percentile(reach, 20)))
+    shown = np.flatnonzero(reach <= farthest)
+    beyond = np.setdiff1d(sequence.part, sequence.part[shown]).tolist()
+    if beyond:
+        log.info(f"{sequence.name}: the picture shows {farthest:.0f} m around the middle, and so not {_names(beyond)}")
     offsets = np.searchsorted(shown, sequence.frame_offsets)
     first = next(frame for frame in map(sequence.frame, range(sequence.num_frames)) if len(frame))
     up = find_up(first.astype(np.float64), None)[0]

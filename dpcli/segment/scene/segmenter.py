@@ -33,7 +33,7 @@ class SceneSegmenter(Segmenter):
     @property
     def slots(self) -> int:
         """Returns how many objects a sequence may have at most, the background included."""
-        return self.settings.most_objects + 1
+        return self.settings.max_objects + 1
 
     def explain(
         self, sequence: CloudSequence, pairs: list[tuple[int, int]], length_unit: str
@@ -81,8 +81,8 @@ class SceneSegmenter(Segmenter):
         """
         if found.dropped:
             log.warn(
-                f"{name}: {found.dropped} moving objects besides the largest {self.settings.most_objects} are assumed to stand"
-                " still; --set most_objects= keeps more"
+                f"{name}: {found.dropped} moving objects besides the largest {self.settings.max_objects} are assumed to stand"
+                " still; --set max_objects= keeps more"
             )
         if apart:
             log.warn(

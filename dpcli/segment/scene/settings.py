@@ -11,7 +11,7 @@ from dpcli.runtime.settings.fields import check, setting
 class SceneSettings:
     """Holds how far things move, and what counts as evidence that one does. Lengths are meters."""
 
-    most_objects: int = setting(31, "--scene: most moving objects of a sequence; the largest are kept.", least=1)
+    max_objects: int = setting(31, "--scene: most moving objects of a sequence; the largest are kept.", least=1)
     travel: float = setting(4.0, "--scene: farthest that an object moves between two frames, meters.", above=0)
     ground: float = setting(0.2, "--scene: height above the ground below which points belong to it, meters.", above=0)
     window: int = setting(3, "--scene: frames before and after a frame that it is compared with.", least=1)

@@ -55,7 +55,7 @@ def motion_from_to(known: dict[int, np.ndarray], source: int, target: int) -> np
 
 
 def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
-    """Returns the motion to a frame; to one that is not known, with the nearest step repeated, a part of it a frame where it
+    """Returns the motion (4,4) to a frame; to one that is not known, with the nearest step repeated, a part of it a frame where it
     leads over several.
     """
     if frame in known or len(known) < 2:

@@ -1,4 +1,4 @@
-"""The flows of all training pairs, kept in files of the run folder and corrected while the network learns (eq. 4.6)."""
+"""The flows of all training pairs, kept in files of the run folder: scene flow updating (eq. 4.6) corrects them."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def rigid_loss(
     translation: Tensor,  # [B, S, 3]
     beta: Tensor | None = None,  # [B, N, S]
 ) -> Tensor:
-    """Returns the rigidity loss of thesis equation 4.8, a scalar.
+    """Returns the rigidity loss of thesis equation 4.8, its segmentation loss, a scalar.
 
     It is the mean over points and slots of beta_is m_is |p_i + f_i - (R_s p_i + t_s)|_2. beta: `consensus_weights`,
     detached here; None counts as 1. The gradient reaches the mask only.
@@ -65,7 +65,7 @@ def consensus_weights(
     mask: Tensor | None = None,  # [B, N, S]
     gate: float = 1e-5,
 ) -> Tensor:  # [B, N, S]
-    """Returns beta of thesis equation 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
+    """Returns the consensus score beta of eq. 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
 
     form "thesis": exp(-tau r_is), r the residual's norm. "release": exp(-tau r_is^2), and only for slots with sum_i
     m_is r_is^2 < gate (needs mask), 1 for the others. The thesis states no tau; the release has 2, or 0.5 with gate 5

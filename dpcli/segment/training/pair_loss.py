@@ -1,4 +1,4 @@
-"""The loss of one batch of pairs: it says which of the thesis's terms are on, and how much each counts (section 4.4.4)."""
+"""The loss of one batch of pairs in online training: which of the thesis's terms are on, how much each counts (section 4.4.4)."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_every_option_is_described_in_a_whole_phrase() -> None:
         ("--lpips vgg", "--lpips is of lpips: name it in --metrics, too"),
         ("--lpips vgg --metrics psnr,clip", "--lpips is of lpips"),
         ("--fvd videogpt --metrics lpips", "--fvd is of fvd"),
-        ("--every 3 --metrics lpips", "--every is of fvd, fid_vid_r3d50, fid_vid_inception"),
+        ("--hop 3 --metrics lpips", "--hop is of fvd, fid_vid_r3d50, fid_vid_inception"),
         ("--background black --metrics parts,tracks", "--background black: parts, tracks compare no pictures"),
     ],
 )
@@ -103,7 +103,7 @@ def test_a_choice_of_a_video_that_no_metric_depends_on_is_refused(words, sentenc
 
 
 @pytest.mark.parametrize(
-    "words", ["--lpips vgg --metrics lpips", "--every 3 --metrics fid_vid_r3d50", "--background black"]
+    "words", ["--lpips vgg --metrics lpips", "--hop 3 --metrics fid_vid_r3d50", "--background black"]
 )
 def test_a_choice_of_a_video_that_a_metric_depends_on_is_taken(words, tmp_path, capsys) -> None:
     assert exit_code("evaluate", "video", tmp_path / "none.h5", "--truth", tmp_path / "none.h5", *words.split()) == 3

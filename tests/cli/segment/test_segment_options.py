@@ -97,7 +97,7 @@ METHODS = prediction_settings.CATALOG.settings["method"]
         ("border", "multibody"),
         ("flexible", "multibody"),
         ("travel", "scene"),
-        ("most_objects", "scene"),
+        ("max_objects", "scene"),
         ("pairs", "multibody scene network dbscan ward ssc trajaffn"),
     ],
 )

@@ -251,7 +251,7 @@ def test_a_whole_video_is_one_clip_and_windows_slide():
             video.add(frame)
         assert video.result().samples == clips and network.module.frames == lengths
     network = FeatureNetwork(VARIANTS["disco"], Color())
-    video = ClipFeatures(network, every=4)
+    video = ClipFeatures(network, hop=4)
     levels = np.arange(24) / 255
     for frame in flat(levels):
         video.add(frame)
@@ -261,7 +261,7 @@ def test_a_whole_video_is_one_clip_and_windows_slide():
 
 def test_memory_is_bounded_by_a_clip():
     network = FeatureNetwork(VARIANTS["disco"], Color())
-    video = ClipFeatures(network, every=20)
+    video = ClipFeatures(network, hop=20)
     for frame in flat([0.5] * 60):
         video.add(frame)
         assert len(video._waiting) <= 16
@@ -290,7 +290,7 @@ def test_bad_pictures_are_refused():
     with pytest.raises(UsageError, match="expected styleganv"):
         feature_variant("tensorflow")
     with pytest.raises(UsageError, match="1 or more"):
-        ClipFeatures(FeatureNetwork(VARIANTS["disco"], Color()), every=0)
+        ClipFeatures(FeatureNetwork(VARIANTS["disco"], Color()), hop=0)
 
 
 def pair(network: FeatureNetwork, levels: list[float], others: list[float]):

@@ -179,7 +179,7 @@ def test_growth_stops_at_the_cap_and_something_always_remains():
     gaussians.seen += 1
     rng = torch.Generator().manual_seed(0)
     gaussians.densify_and_prune(
-        optimizer, replace(QUICK, grow_share=0.9, gaussians=24, most_gaussians=24), rng, grow=True
+        optimizer, replace(QUICK, grow_share=0.9, gaussians=24, max_gaussians=24), rng, grow=True
     )
     assert len(gaussians) == 24
     gaussians.opacity_logit.data[:] = -20.0

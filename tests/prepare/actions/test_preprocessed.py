@@ -278,7 +278,7 @@ def test_options_that_do_not_fit(tmp_path):
         (lambda: open_preprocessed(tmp_path, form="kitti"), "--form kitti: expected one of auto"),
         (lambda: open_preprocessed(tmp_path / "n", protocol="x"), "--protocol x: expected xsub or xview"),
         (lambda: open_preprocessed(tmp_path / "n", scale=-1.0), "--scale -1: expected stored units"),
-        (lambda: PtsLabel(tmp_path, 5), "--labels 5: expected 14 or 28"),
+        (lambda: PtsLabel(tmp_path, 5), "--classes 5: expected 14 or 28"),
     ):
         with pytest.raises(UsageError, match=message):
             call()
@@ -367,7 +367,7 @@ def test_the_commands(tmp_path):
     write_pts(tmp_path / "p", A, B)
     write_shapes(tmp_path / "m", SHAPES)
     for words, expected in (
-        (("preprocessed", tmp_path / "p", "--labels", 14), "2 sequences, 8 frames, 128 points, 0 skipped"),
+        (("preprocessed", tmp_path / "p", "--classes", 14), "2 sequences, 8 frames, 128 points, 0 skipped"),
         (("modelnet40", tmp_path / "m"), "6 sequences, 6 frames, 192 points, 0 skipped"),
     ):
         result = dpc("prepare", *words, "-o", tmp_path / f"{words[0]}.h5", "--jobs", 1)

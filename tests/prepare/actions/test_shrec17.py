@@ -282,7 +282,7 @@ def test_folders_that_are_none(tmp_path):
     (write_lists(tmp_path / "half", ["1 1 2 1 1 1 3"]) / "test_gestures.txt").unlink()
     with pytest.raises(DataError, match="test_gestures.txt: not found"):
         Shrec17(tmp_path / "half").items()
-    with pytest.raises(UsageError, match="--labels 20: expected 14 or 28"):
+    with pytest.raises(UsageError, match="--classes 20: expected 14 or 28"):
         Shrec17(tmp_path, 20)
     with pytest.raises(UsageError, match="--median 4: expected 0 or 3 or 5"):
         Shrec17(tmp_path, median=4)
@@ -296,7 +296,7 @@ def test_the_command(tmp_path):
         tmp_path / "raw",
         "-o",
         tmp_path / "o.h5",
-        "--labels",
+        "--classes",
         "14",
         "--points",
         "256",

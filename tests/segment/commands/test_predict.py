@@ -223,7 +223,7 @@ def test_settings_of_tracks_and_of_the_search_are_told_apart(dpc_here, tmp_path)
     words = ("--set", "flexible=0.1", "--flow", "icp")
     done = dpc_here(*predict, tmp_path / "c1.h5", "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 2 and b"--flow icp uses none" in done.stderr
-    words = ("--set", "flexible=0.1", "--set", "border=0.1", "--set", "most_bodies=3")
+    words = ("--set", "flexible=0.1", "--set", "border=0.1", "--set", "max_bodies=3")
     done = dpc_here(*predict, tmp_path / "c1.h5", "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 0 and b"warning: border: not read where points have tracks" in done.stderr
 

@@ -312,9 +312,9 @@ def test_points_in_one_place_and_far_apart_frames():
     assert np.isfinite(predicted(apart)[1].motion).all()
 
 
-def test_most_bodies_is_kept_and_one_thread_and_two_give_the_same_answer():
+def test_the_most_bodies_are_kept_to_and_one_thread_and_two_give_the_same_answer():
     clouds = [np.float32(chest().frame(t)) for t in range(3)]
-    one = explain_sequence(clouds, MultibodySettings(most_bodies=1))
+    one = explain_sequence(clouds, MultibodySettings(max_bodies=1))
     assert len(one.bodies) == 1
     first, second = (explain_sequence(clouds, MultibodySettings(), threads=threads) for threads in (1, 2))
     assert first.energy == second.energy and (first.label == second.label).all() and first.energy < one.energy

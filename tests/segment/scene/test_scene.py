@@ -284,7 +284,7 @@ def test_frames_too_far_apart_in_time_for_the_search_are_told(step, travel, warn
 
 
 def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
-    labels, said = explained(street(), most_objects=1)
+    labels, said = explained(street(), max_objects=1)
     assert "street: 1 moving objects besides the largest 1" in capsys.readouterr().err
     assert said.probability.shape[1] == 2 and set(np.unique(np.concatenate(labels))) == {0, 1}
     ids, counts = np.unique(street().part[np.concatenate(labels) == 1], return_counts=True)
@@ -319,6 +319,15 @@ def test_a_scene_whose_first_frame_is_empty_is_drawn_upright():
     sequence.points = 1000 * sequence.points
     shown, look = picture_of_scene(sequence, "mm")
     assert look.up == "z" and look.gray == "0, stands" and shown.frame_offsets[1] == 0 < len(shown.points) == count
+
+
+def test_a_picture_tells_which_objects_are_too_far_away_for_it(capsys):
+    cloud = np.concatenate([street().frame(0), [[80, 0, 1], [3, 0, 1], [0, 90, 1]]])
+    part = np.zeros(len(cloud), int)
+    part[-3:] = 1, 2, 7
+    shown, _ = picture_of_scene(CloudSequence.from_frames("s", [cloud], part=[part]), "m")
+    assert np.unique(shown.part).tolist() == [-1, 2]
+    assert "s: the picture shows 30 m around the middle, and so not objects 1, 7" in capsys.readouterr().err
 
 
 def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():

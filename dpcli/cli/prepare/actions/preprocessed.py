@@ -22,8 +22,8 @@ def preprocessed(
             "--form", help="msraction3d, ntu60: one .npz per video. pts_label: gestures. auto: by the first file found."
         ),
     ] = "auto",
-    labels: Annotated[
-        Literal["28", "14"], typer.Option("--labels", help="Classes of SHREC'17: 28 (gesture and fingers) or 14.")
+    classes: Annotated[
+        Literal["28", "14"], typer.Option("--classes", help="Classes of SHREC'17: 28 (gesture and fingers) or 14.")
     ] = "28",
     lists: Annotated[
         Path | None, typer.Option("--lists", help="Folder of SHREC'17's two list files. Default: RAW.")
@@ -39,5 +39,5 @@ def preprocessed(
     from dpcli.prepare.actions.preprocessed import open_preprocessed
 
     run_conversion(
-        "preprocessed", lambda: open_preprocessed(raw, form, int(labels), lists, protocol, scale), conversion, raw
+        "preprocessed", lambda: open_preprocessed(raw, form, int(classes), lists, protocol, scale), conversion, raw
     )

@@ -14,8 +14,8 @@ from dpcli.cli.prepare.options import PixelCoordinates
 def shrec17(
     raw: Annotated[Path, typer.Argument(help="Folder of train_gestures.txt, test_gestures.txt and gesture_1/ ...")],
     *,
-    labels: Annotated[
-        Literal["28", "14"], typer.Option("--labels", help="Classes: 28 (gesture and fingers) or 14 (gesture).")
+    classes: Annotated[
+        Literal["28", "14"], typer.Option("--classes", help="Classes: 28 (gesture and fingers) or 14 (gesture).")
     ] = "28",
     bbox: Annotated[
         bool,
@@ -43,7 +43,7 @@ def shrec17(
         "shrec17",
         lambda: Shrec17(
             raw=raw,
-            labels=int(labels),
+            classes=int(classes),
             bbox=bbox,
             foreground=foreground,
             median=int(median),

@@ -82,14 +82,14 @@ class FeatureNetwork:
 class ClipFeatures:
     """Computes the features of one video's clips while its frames stream in; holds one clip at most.
 
-    every: a window starts at each so many frames (1 in the published code). frames: all that came; used: those that lie
+    hop: a window starts at each so many frames (1 in the published code). frames: all that came; used: those that lie
     in a clip.
     """
 
-    def __init__(self, network: FeatureNetwork, every: int = 1) -> None:
-        if every < 1:
-            raise UsageError(f"a window every {every} frames: expected 1 or more")
-        self.network, self.every, self.frames, self.used = network, every, 0, 0
+    def __init__(self, network: FeatureNetwork, hop: int = 1) -> None:
+        if hop < 1:
+            raise UsageError(f"a window every {hop} frames: expected 1 or more")
+        self.network, self.hop, self.frames, self.used = network, hop, 0, 0
         self._row = self._longest = self._new = 0  # frames without a gap, at present and at most; since the last clip
         self._waiting: deque[torch.Tensor] = deque(maxlen=network.variant.clip)
         self._found: FeatureStatistics | None = None
@@ -105,7 +105,7 @@ class ClipFeatures:
         self._waiting.append(prepare_frame(self.network.variant, picture))
         self.frames, self._row, self._new = self.frames + 1, self._row + 1, self._new + 1
         self._longest = max(self._longest, self._row)
-        if clip is not None and self._row >= clip and (self._row - clip) % self.every == 0:
+        if clip is not None and self._row >= clip and (self._row - clip) % self.hop == 0:
             self._take_clip()
 
     def restart(self) -> None:
@@ -148,8 +148,8 @@ class VideoPair:
 class VideoFeatures:
     """Computes the features of one predicted video and of the true one, frame by frame, for one metric."""
 
-    def __init__(self, network: FeatureNetwork, every: int = 1) -> None:
-        self._sides = ClipFeatures(network, every), ClipFeatures(network, every)
+    def __init__(self, network: FeatureNetwork, hop: int = 1) -> None:
+        self._sides = ClipFeatures(network, hop), ClipFeatures(network, hop)
 
     def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
         """Takes the next frame of both, f32 (3,H,W) in 0..1. Raises as `ClipFeatures.add`."""

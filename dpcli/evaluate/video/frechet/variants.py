@@ -95,9 +95,9 @@ def feature_variant(name: str) -> FeatureVariant:
     return VARIANTS[name]
 
 
-def feature_choices(variant: FeatureVariant, every: int = 1) -> dict[str, Any]:
-    """Returns every choice of a variant in words, for a result that stands alone. every: frames between starts of windows."""
-    windows = f"windows of {variant.clip} frames, one from every {every}" if every > 1 else f"windows of {variant.clip}"
+def feature_choices(variant: FeatureVariant, hop: int = 1) -> dict[str, Any]:
+    """Returns every choice of a variant in words, for a result that stands alone. hop: frames between starts of windows."""
+    windows = f"windows of {variant.clip} frames, one from every {hop}" if hop > 1 else f"windows of {variant.clip}"
     clips = "the whole video" if variant.clip is None else "single frames" if variant.clip == 1 else windows
     named = {key: value for key, value in asdict(variant).items() if key not in ("clip", "least", "single")}
     rule = {"mean": "distance of means alone", "error": "an error"}[variant.single]

@@ -17,14 +17,14 @@ class FrechetMetric(LearnedMetric):
         from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
 
         variant = networks.fvd if name == "fvd" else name.removeprefix("fid_vid_")
-        self.name, self._every, self._views, self._pairs = name, networks.every, [], []
+        self.name, self._hop, self._views, self._pairs = name, networks.hop, [], []
         self._network = FeatureNetwork.load(variant, folder, device)
 
     def start(self, view: str) -> None:
         """Begins a video."""
         from dpcli.evaluate.video.frechet.clip_features import VideoFeatures
 
-        self._video, self._gap = VideoFeatures(self._network, self._every), FrameGap()
+        self._video, self._gap = VideoFeatures(self._network, self._hop), FrameGap()
         self._views.append(view)
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
@@ -45,5 +45,5 @@ class FrechetMetric(LearnedMetric):
         found = video_distance(self._network.variant, self._pairs)
         each = dict(zip(self._views, found.each, strict=True)) if found.each else {}
         counts = {"videos": found.videos, "clips": found.clips, "frames": found.frames}
-        choices = feature_choices(found.variant, self._every)
+        choices = feature_choices(found.variant, self._hop)
         return LearnedScore(self.name, found.value, each, counts=counts, choices=choices)

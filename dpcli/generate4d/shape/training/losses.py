@@ -60,7 +60,7 @@ def depth_error(depth: Tensor, truth: Tensor) -> Tensor:
 
 
 def difference_error(depth: Tensor, truth: Tensor) -> Tensor:
-    """Returns the mean error of the differences of neighboring pixels of both first layers, at most 0.1 each."""
+    """Returns the mean error of the differences of neighboring pixels of both first layers (B,L,H,W), at most 0.1 each."""
     total, count = depth.new_zeros(()), depth.new_zeros(())
     for axis in (2, 3):
         own, true = (torch.diff(x[:, :2], dim=axis) for x in (depth, truth))

@@ -24,7 +24,7 @@ class ShapeSchedule:
     round: int = setting(1024, "Pictures made per round; a training begins with four times as many.", least=1)
     rounds: int = setting(24, "Rounds of pictures that are kept.", least=1)
     reuse: int = setting(6, "Times that a picture is seen.", least=1)
-    bfloat16: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
+    amp: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
 
     def __post_init__(self) -> None:
         check(self)
@@ -70,7 +70,7 @@ PRESETS = {
     "gpu": {  # eight minutes of an H200; models are the bottleneck, so each is seen from many sides
         "network": ShapeConfig(widths=(48, 96, 192, 320), hidden=256, lengths=True),
         "schedule": ShapeSchedule(
-            steps=9000, batch=512, decoded=512, lr=3e-3, round=2048, rounds=24, reuse=3, bfloat16=True
+            steps=9000, batch=512, decoded=512, lr=3e-3, round=2048, rounds=24, reuse=3, amp=True
         ),
         "data": ShapeData(views=24, warp=0.15, validation=768),
     },

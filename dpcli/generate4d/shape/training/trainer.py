@@ -116,7 +116,7 @@ class ShapeTrainer:
         rng = generator(self.seed, Generate4DStream.SHAPE_STEP, self.step)
         batch = window.draw(self.schedule.batch, rng)
         guessed = torch.from_numpy(rng.random(min(self.schedule.decoded, self.schedule.batch)) < _GUESSED)
-        with reduced_products(self.device, self.schedule.bfloat16):
+        with reduced_products(self.device, self.schedule.amp):
             loss, parts = shape_loss(self.model, batch, guessed.to(self.device))
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()

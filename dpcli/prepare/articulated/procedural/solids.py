@@ -1,4 +1,4 @@
-"""Simple solids as triangles, and a builder that joins them with hinges and slides into an articulated object."""
+"""Simple solids as triangles f64 (T,3,3), and a builder that joins them with hinges and slides into an articulated object."""
 
 from __future__ import annotations
 

@@ -274,8 +274,8 @@ def test_the_thesis_compares_pixels_of_the_reference_and_features_of_all_views(f
 
 
 def test_options_replace_a_protocols_networks() -> None:
-    chosen = video_protocol("consistent4d", lpips="squeeze", fvd="videogpt", every=4)
-    assert (chosen.networks.lpips, chosen.networks.fvd, chosen.networks.every) == ("squeeze", "videogpt", 4)
+    chosen = video_protocol("consistent4d", lpips="squeeze", fvd="videogpt", hop=4)
+    assert (chosen.networks.lpips, chosen.networks.fvd, chosen.networks.hop) == ("squeeze", "videogpt", 4)
     assert chosen.size == 512 and PROTOCOLS["disco"].networks.lpips_range01
     for wrong in ({"lpips": "resnet"}, {"fvd": "i3d"}):
         with pytest.raises(UsageError, match="expected"):
