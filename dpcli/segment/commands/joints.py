@@ -142,7 +142,7 @@ def _write_urdf(trees: Trees, output: Path, reader: PartsReader, force: bool) ->
 
 
 def _write_json(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
-    write_trees(output, [tree_json(tree, sequence.name, reader.length_unit) for _, sequence, tree in trees])
+    write_trees(output, [tree_json(tree, sequence, reader.length_unit) for _, sequence, tree in trees])
 
 
 def _write_folder(trees: Trees, output: Path, reader: PartsReader, force: bool) -> None:
@@ -161,7 +161,7 @@ def _fill_folder(folder: Path, trees: Trees, reader: PartsReader) -> None:
     objects, names = [], file_names(reader.names)
     for index, sequence, tree in trees:
         write_urdf(folder / f"{names[index]}.urdf", tree, sequence.name, reader.length_unit)
-        objects.append(tree_json(tree, sequence.name, reader.length_unit))
+        objects.append(tree_json(tree, sequence, reader.length_unit))
     write_trees(folder / "joints.json", objects)
 
 

@@ -14,6 +14,7 @@ from dpcli.runtime.whole_file import make_folder, write_whole
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, PartJoint
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.standard_streams import printable
+from dpcli.store import CloudSequence
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE, TYPES
 from dpcli.store.schema import METERS
 
@@ -88,17 +89,19 @@ def _obj(vertices: np.ndarray, triangles: np.ndarray) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def tree_json(tree: KinematicTree, name: str, unit: str) -> dict[str, Any]:
-    """Returns the tree as an object for JSON: root, joints with axis, origin, range and value in each frame.
+def tree_json(tree: KinematicTree, sequence: CloudSequence, unit: str) -> dict[str, Any]:
+    """Returns the tree of a sequence as an object for JSON: root, joints with axis, origin, range and value in each frame.
 
-    Coordinates are those of frame 0 in `unit`, angles are radians. root_motion: the root's motion (4,4) from frame 0 to
-    each frame; a free joint has the child's motion as the parent sees it.
+    Coordinates are those of frame 0 in `unit`, angles are radians; with `shift` added they are the original ones, which is
+    there where something was taken off. root_motion: the root's motion (4,4) from frame 0 to each frame; a free joint has
+    the child's motion as the parent sees it.
     """
     trajectories, ids = tree.trajectories, tree.trajectories.ids
     root = trajectories.motion[:, tree.root]
     return {
-        "name": name,
+        "name": sequence.name,
         "length_unit": unit,
+        **({} if sequence.shift is None else {"shift": sequence.shift.tolist()}),
         "parts": ids.tolist(),
         "root": int(ids[tree.root]),
         "root_motion": root.tolist(),

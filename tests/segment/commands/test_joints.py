@@ -209,6 +209,43 @@ def test_surfaces_have_one_shape_in_any_unit_and_place(place, unit, flat):
     assert np.allclose(np.ptp(found, 0), unit * np.ptp(shape, 0), rtol=0.01)
 
 
+def _box(kind, rng):
+    """Returns points on a box of 0.8 x 0.8 x 0.4: random ones, random ones with noise, or a grid, as after thinning to voxels."""
+    if kind == "grid":
+        points = np.stack(np.meshgrid(*[np.arange(n) for n in (21, 21, 11)], indexing="ij"), -1).reshape(-1, 3)
+        return 0.04 * points[((points == 0) | (points == [20, 20, 10])).any(1)]
+    points, axis = rng.random((3000, 3)), rng.choice(3, 3000, p=[0.25, 0.25, 0.5])
+    points[np.arange(3000), axis] = points[np.arange(3000), axis].round()
+    return points * [0.8, 0.8, 0.4] + rng.normal(size=(3000, 3)) * (0.008 if kind == "noise" else 0)
+
+
+@pytest.mark.parametrize("kind", ["grid", "random", "noise"])
+def test_a_surface_has_no_holes_in_flat_sides(kind):
+    """Without noise an alpha shape of tetrahedra alone covers half of the box or less."""
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(0)
+    vertices, triangles = part_surface(_box(kind, rng))
+    corners = vertices[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    share = rng.dirichlet(np.ones(3), 20_000)
+    found = (share[..., None] * corners[rng.choice(len(area), 20_000, p=area / area.sum())]).sum(1)
+    assert (cKDTree(found).query(_box("random", rng))[0] < 0.04).mean() > 0.97
+    if kind == "grid":
+        assert np.isclose(
+            (corners.mean(1) * normal).sum() / 6, 0.8 * 0.8 * 0.4
+        )  # closed, and all triangles face outward
+
+
+def test_points_in_a_plane_have_a_thin_plate_as_their_surface():
+    plane = np.random.default_rng(0).random((500, 3)) * [1, 1, 0] + 7
+    vertices, triangles = part_surface(plane)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 > 1.6  # both sides of a square
+    assert 0 < np.ptp(vertices[:, 2]) < 0.01
+
+
 def test_copies_of_points_change_no_joint(few, tmp_path):
     with PartsReader(few) as reader:
         options = {"num_parts": reader.num_parts, "class_names": reader.class_names, "length_unit": reader.length_unit}
@@ -262,6 +299,16 @@ def test_a_part_that_frame_0_does_not_show_is_told(hidden, tmp_path, capsys):
     said = predicted(tmp_path / "parts.h5", sequences)
     find_joints(str(said), tmp_path / "joints.json", sequence=None, picture=None, force=False)
     assert ("is a guess: part 1 of second\n" in capsys.readouterr().err) == hidden
+
+
+def test_what_was_taken_off_the_coordinates_stands_in_the_json(tmp_path):
+    """Without it nobody finds an axis again in a map, where the frames of `predict --ply` lie."""
+    sequences = [drawer("map", 0), drawer("room", 0)]
+    sequences[0].shift = np.array([500_000.0, 5_400_000.0, 100.0])
+    said = predicted(tmp_path / "parts.h5", sequences)
+    find_joints(str(said), tmp_path / "joints.json", sequence=None, picture=None, force=False)
+    found = json.loads((tmp_path / "joints.json").read_text())
+    assert [one.get("shift") for one in found] == [[500_000.0, 5_400_000.0, 100.0], None]
 
 
 @pytest.mark.parametrize(("turn", "said"), [(0.0, 0), (0.8, 1)])
