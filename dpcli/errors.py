@@ -45,7 +45,7 @@ class Stopped(DpcError):
 
 
 def first_line(error: BaseException) -> str:
-    """Returns the first line of what a library's error says, or its type where it says nothing.
+    r"""Returns the first line of what a library's error says, or its type where it says nothing.
 
     >>> first_line(ValueError("no number\nat line 3")), first_line(KeyError())
     ('no number', 'KeyError')

@@ -59,10 +59,9 @@ def test_a_video_in_such_a_folder_ends_with_a_sentence_where_decoders_crash(lati
         assert done.returncode == 3 and b"can't open it; rename it" in done.stderr
 
 
-def test_weights_and_urdfs_there_end_with_a_sentence(latin1):
+def test_weights_there_are_read_and_urdfs_end_with_a_sentence(latin1):
     save_weights(latin1 / "m.safetensors", {"w": torch.ones(2)}, {"format": "f"})
-    with pytest.raises(DataError, match=r"caf\\xe9/m.safetensors: .* safetensors can't open it"):
-        load_weights(latin1 / "m.safetensors", "f", "dpc")
+    assert load_weights(latin1 / "m.safetensors", "f", "dpc")[0]["w"].tolist() == [1, 1]
     (latin1 / "robot.urdf").write_text('<robot name="r"><link name="a"/></robot>')
     with pytest.raises(DataError, match="yourdfpy can't open it; rename it"):
         read_skeleton(latin1 / "robot.urdf")

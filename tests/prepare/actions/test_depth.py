@@ -337,7 +337,7 @@ def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
         ("name,label\na\n", "labels.csv:2"),
         ("name,color\na,1\n", "labels.csv:1: columns name,color"),
         ("name,label\na,1\nb,two\n", "some labels are numbers and some are words"),
-        ("name,label,subject\na,1,x\n", "labels.csv:2: subject 'x'"),
+        ("name,label,subject\na,1,x1y\n", "labels.csv:2: subject 'x1y'"),
         ("", "no rows"),
     ],
 )
