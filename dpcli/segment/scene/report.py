@@ -1,4 +1,4 @@
-"""Lines that tell a person what was found in scenes, to be checked against what he knows of them."""
+"""What people are told and shown of scenes, to be checked against what they know of them."""
 
 from __future__ import annotations
 
