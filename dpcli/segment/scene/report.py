@@ -1,4 +1,4 @@
-"""What people are told and shown of scenes, to be checked against what they know of them."""
+"""Lines that tell people what was found in scenes, to be checked against what they know of these."""
 
 from __future__ import annotations
 
