@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,9 @@ from dpcli.errors import UsageError
 
 CAMERA_VIEW = "xyz"  # right, down, away: OpenCV camera axes
 IMAGE_VIEW = "yx-z"  # row, column and a depth that grows toward the viewer
+_CAMERA_AXES = re.compile(
+    r"prepare (depth|msraction3d|ntu60|synthetic gestures)\b|generate4d export\b(?!.*--axes[ =]keep)|--coordinates[ =]camera"
+)
 
 
 def parse_view(text: str) -> np.ndarray:  # [3, 3]
@@ -36,6 +41,15 @@ def default_view(length_unit: str) -> str:
     ('xyz', 'yx-z')
     """
     return IMAGE_VIEW if "row, column" in length_unit else CAMERA_VIEW
+
+
+def upright_axis(provenance: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the axis that points upwards in a file: -y where one of the commands that made it writes camera axes, else z.
+
+    >>> upright_axis([{"command": "dpc prepare depth my_videos --fov 60"}]), upright_axis([])
+    ('-y', 'z')
+    """
+    return "-y" if any(_CAMERA_AXES.search(str(entry.get("command"))) for entry in provenance) else "z"
 
 
 def turntable_view(azimuth: float, elevation: float, up: str = "z") -> np.ndarray:  # [3, 3]
