@@ -47,7 +47,7 @@ class Look:
 def usual_look(provenance: Sequence[Mapping[str, Any]], cell: int = 200) -> Look:
     """Returns how the parts of a file are drawn, upright by what its provenance tells of its axes."""
     up = upright_axis(provenance)
-    return Look(cell, up, _AZIMUTH if up == "z" else _BESIDE_THE_CAMERA)
+    return Look(cell, up, _BESIDE_THE_CAMERA if up == "-y" else _AZIMUTH)
 
 
 def parts_picture(path: Path, sequences: Sequence[CloudSequence], *, frames: int = 4, look: Look | None = None) -> None:

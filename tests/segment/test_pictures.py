@@ -64,13 +64,14 @@ def color_left(mean: np.ndarray, color: np.ndarray) -> float:
         ("dpc prepare kitti-sf RAW --coordinates camera", 1),
         ("dpc prepare synthetic articulated --view single", 2),
         ("dpc prepare clouds scans/depth", 2),
+        ("dpc prepare kitti-det RAW", -1),
     ],
 )
 def test_what_stands_is_drawn_standing_with_its_head_up(command: str, axis: int, tmp_path: Path) -> None:
-    """The head, part 0, lies at y = -1 in camera axes, and at z = 1 in those of rooms and tables."""
+    """The head, part 0, lies at y = -1 in camera axes (1), at y = 1 in KITTI's (-1), and at z = 1 in those of rooms (2)."""
     body = np.random.default_rng(0).uniform(-0.2, 0.2, (400, 3))
-    body[:, axis] = np.linspace(-1, 1, 400)
-    head = body[:, axis] * (1 if axis == 2 else -1) > 0
+    body[:, abs(axis)] = np.linspace(-1, 1, 400)
+    head = body[:, abs(axis)] * (-1 if axis == 1 else 1) > 0
     body = CloudSequence.from_frames("who", [body], part=[np.where(head, 0, 1)])
     parts_picture(
         tmp_path / "a.png", [body], look=usual_look([{"command": command}, {"command": "dpc segment predict"}])
