@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 DPC    := $(BIN)/dpc
 
-# The demo learns real actions when MSRACTION names a folder of MSRAction-3D, synthetic gestures otherwise.
+# The demo learns real actions when MSRACTION names a folder of MSR-Action3D, synthetic gestures otherwise.
 MSRACTION ?=
 ifneq ($(strip $(MSRACTION)),)
 DEMO       := demo/msraction3d
@@ -28,23 +28,23 @@ export PYTHONUTF8 := 1
 .PHONY: few-videos segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
-	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
+	@echo "make demo [MSRACTION=folder]  depth videos -> a trained Kinet -> a table; rigid parts; a 4D scene; results in demo/"
 	@echo "make test                     lint, the examples in docstrings, the whole test suite"
 	@echo "make lint                     ruff over everything: faults and format"
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
 	@echo "make table-3.1 NVGESTURE=folder [MODELNET=folder]  ablations of Kinet; or MSRACTION=folder"
 	@echo "make table-3.2 NVGESTURE=folder, table-3.3 SHREC17=folder, table-3.5 NTU60=folder  accuracy"
 	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; over an hour on 2 cores"
-	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
+	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; a day"
 	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
 	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/reproduce.md says more of all of these"
-	@echo "make segments MSRACTION=folder actions found in long recordings; ten minutes"
+	@echo "make segments MSRACTION=folder actions found in long recordings; eight minutes"
 	@echo "make few-videos MSRACTION=folder accuracy against videos a class, fine-tuned and not; two hours"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-4.3 MESHES=folder | OGC=folder  rigid parts of rooms, all methods"
 	@echo "make table-4.4 KITTI_SF=folder, table-4.5 KITTI_DET=folder, table-4.6 SEMANTICKITTI=folder  objects of streets"
-	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
+	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, six rows and that of the thesis; hours"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make figure-5.3 MESHES=folder the same clips, control points and weight of temporal preservation; an hour and a half"
 	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
@@ -104,7 +104,7 @@ FLOW      ?= icp
 # needs-GOAL stops make where GOAL lacks its data. The last line reads it of each goal asked for, before .venv takes minutes.
 needs      = $(if $(strip $($(1))),,$(error make $(goal) needs $(1)=folder, $(2)))
 needs_either = $(if $(strip $(NVGESTURE)$(MSRACTION)),,$(error make $(goal) needs NVGESTURE=folder or MSRACTION=folder))
-MSR_IS    := the folder of MSRAction-3D's depth videos
+MSR_IS    := the folder of MSR-Action3D's depth videos
 GLB_IS    := a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it
 NV_IS     := the folder of NvGesture's lists and Video_data
 EITHER     = $(if $(strip $(NVGESTURE)),nvgesture "$(NVGESTURE)",msraction3d "$(MSRACTION)")

@@ -88,7 +88,8 @@ def _clouds(path: Path, facts: PageFacts, *, samples: int, chosen: Sequence[str]
     from dpcli.store import CloudsReader
 
     with CloudsReader(path) as reader:
-        axes = parse_view(view or default_view(reader.length_unit)) * np.array([[1], [-1], [-1]], np.float32)
+        seen = parse_view(view or default_view(reader.length_unit, reader.provenance))
+        axes = seen * np.array([[1], [-1], [-1]], np.float32)
         rows = _chosen(reader, chosen, samples)
         frames = {row: spread_evenly(int(reader.frame_counts[row]), frame_budget(len(rows))) for row in rows}
         most = point_budget(sum(map(len, frames.values())))

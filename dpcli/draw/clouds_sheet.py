@@ -42,7 +42,7 @@ def clouds_sheet(reader: CloudsSource, path: Path, samples: int = 8, frames: int
 
     The scale is the same within a row. Reads only the frames it shows. Raises DataError when the picture can't be written.
     """
-    axes = parse_view(view or default_view(reader.length_unit))
+    axes = parse_view(view or default_view(reader.length_unit, reader.provenance))
     rows = []
     for index in spread_samples(reader.labels, samples):
         shown = spread_evenly(int(reader.frame_counts[index]), frames)

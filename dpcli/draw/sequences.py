@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,6 +35,7 @@ class CloudsSource(Protocol):
     splits: Sequence[str]
     labels: np.ndarray  # [S]
     frame_counts: np.ndarray  # [S]
+    provenance: Sequence[Mapping[str, Any]]
 
     def read(self, index: int, frames: Any, fields: Any) -> PointSequence:
         """Returns some frames of a sequence with some of its fields."""

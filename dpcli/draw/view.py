@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,14 @@ from dpcli.errors import UsageError
 
 CAMERA_VIEW = "xyz"  # right, down, away: OpenCV camera axes
 IMAGE_VIEW = "yx-z"  # row, column and a depth that grows toward the viewer
+# By the words of a command: the view that its files look upright in.
+_VIEW_OF_COMMANDS = (
+    (r"--coordinates[ =]camera|prepare (depth|msraction3d|ntu60|synthetic gestures)\b", CAMERA_VIEW),
+    (r"prepare (kitti-sf|kitti-det|semantickitti)\b", "-x-yz"),  # as published: x left, y up, z forward
+    (r"prepare (sapien|synthetic articulated)\b", "x-zy"),
+    (r"generate4d export\b.*--axes[ =]keep", "x-y-z"),
+    (r"generate4d export\b", CAMERA_VIEW),
+)
 
 
 def parse_view(text: str) -> np.ndarray:  # [3, 3]
@@ -29,13 +39,34 @@ def parse_view(text: str) -> np.ndarray:  # [3, 3]
     return matrix
 
 
-def default_view(length_unit: str) -> str:
-    """Returns the view of a file from its unit: image coordinates (row, column, ...) are turned upright.
+def default_view(length_unit: str, provenance: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Returns the view of a file from its unit, as image coordinates (row, column, ...) are turned upright, and its commands.
 
     >>> default_view("m"), default_view("pixel (row, column), gray level")
     ('xyz', 'yx-z')
+    >>> default_view("m", [{"command": "dpc prepare kitti-sf RAW"}, {"command": "dpc segment predict"}])
+    '-x-yz'
     """
-    return IMAGE_VIEW if "row, column" in length_unit else CAMERA_VIEW
+    return IMAGE_VIEW if "row, column" in length_unit else _known_view(provenance) or CAMERA_VIEW
+
+
+def upright_axis(provenance: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the axis that points upwards in a file, by the commands that made it; z where they don't tell.
+
+    >>> upright_axis([{"command": "dpc prepare depth my_videos --fov 60"}]), upright_axis([])
+    ('-y', 'z')
+    """
+    down = re.findall("-?[xyz]", _known_view(provenance) or "x-zy")[1]
+    return down[1:] if down[0] == "-" else f"-{down}"
+
+
+def _known_view(provenance: Sequence[Mapping[str, Any]]) -> str | None:
+    """Returns the view of the last command whose axes are known."""
+    for entry in reversed(provenance):
+        for words, view in _VIEW_OF_COMMANDS:
+            if re.search(words, str(entry.get("command"))):
+                return view
+    return None
 
 
 def turntable_view(azimuth: float, elevation: float, up: str = "z") -> np.ndarray:  # [3, 3]

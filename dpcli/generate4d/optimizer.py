@@ -45,7 +45,7 @@ class StepResult:
 class SceneOptimizer:
     """Fits a `Model4D` to pictures with Adam, first its dense stage (eq. 5.7), then the sparse one (eq. 5.9).
 
-    prior: judges random new views (eq. C.11); shape: shows every frame from new sides; None: none does. regularize: keeps
+    prior: judges random novel views (eq. C.11); shape: shows every frame from novel views; None: none does. regularize: keeps
     one view's object from going flat (`thickness`, `aspect`).
     `start` or `restore` must be called before the first step.
     """
@@ -170,7 +170,7 @@ class SceneOptimizer:
         return loss, float(np.mean(squared)) if squared else math.nan, notes
 
     def _prior_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
-        """Returns the prior's loss on random new views of the step's frames (C.11)."""
+        """Returns the prior's loss on random novel views of the step's frames (C.11)."""
         size = min(max(self.targets.size), _PRIOR_SIZE)
         cameras, poses, intrinsics = self._novel_cameras(len(frames), size, rng)
         white = torch.ones(len(frames), 3, device=self.device)
@@ -178,7 +178,7 @@ class SceneOptimizer:
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
     def _shape_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
-        """Returns the loss on the shape prior's pictures of the step's frames from random new sides."""
+        """Returns the loss on the shape prior's pictures of the step's frames from random novel views."""
         config, size = self.config, min(self.config.shape_size, *self.targets.size)
         _, poses, intrinsics = self._novel_cameras(len(frames), size, rng)
         background = self._backgrounds(len(frames), rng)

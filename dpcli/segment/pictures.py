@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,13 @@ from dpcli.draw.fonts import text_font
 from dpcli.draw.palette import LIGHT, part_colors
 from dpcli.draw.points import Raster, draw_balls
 from dpcli.draw.sheet import save_picture, spread_evenly, write_line
-from dpcli.draw.view import turntable_view
+from dpcli.draw.view import turntable_view, upright_axis
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence
 
 _GAP, _TITLE = 8, 22
 _AZIMUTH, _ELEVATION = np.deg2rad(-60.0), np.deg2rad(22.0)
+_BESIDE_THE_CAMERA = np.deg2rad(-25.0)  # the side that a camera saw, and yet some depth
 _MARGIN = 1.12  # of the picture around what is seen
 _RATE = 15  # images per second of an animation
 
@@ -41,6 +42,12 @@ class Look:
     def __post_init__(self) -> None:
         if self.up not in ("x", "y", "z", "-x", "-y", "-z"):
             raise UsageError(f"up axis {self.up!r}: expected x, y, z, -x, -y or -z")
+
+
+def usual_look(provenance: Sequence[Mapping[str, Any]], cell: int = 200) -> Look:
+    """Returns how the parts of a file are drawn, upright by what its provenance tells of its axes."""
+    up = upright_axis(provenance)
+    return Look(cell, up, _BESIDE_THE_CAMERA if up == "-y" else _AZIMUTH)
 
 
 def parts_picture(path: Path, sequences: Sequence[CloudSequence], *, frames: int = 4, look: Look | None = None) -> None:

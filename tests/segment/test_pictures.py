@@ -14,7 +14,7 @@ from PIL import Image
 from dpcli.draw.palette import PALETTE
 from dpcli.draw.ply import write_ply, write_ply_frames
 from dpcli.errors import DataError, UsageError
-from dpcli.segment.pictures import Look, _legend, parts_picture, there_and_back, turntable
+from dpcli.segment.pictures import Look, _legend, parts_picture, there_and_back, turntable, usual_look
 from dpcli.store import CloudSequence
 
 WHITE = (255, 255, 255)
@@ -53,6 +53,34 @@ def test_one_part_has_its_color(sequence: CloudSequence, tmp_path: Path) -> None
 def color_left(mean: np.ndarray, color: np.ndarray) -> float:
     """What of a mean color is no mixture of the color (in any light) and white."""
     return float(np.linalg.lstsq(np.stack([color / 255, np.ones(3)], 1), mean, rcond=None)[1][0])
+
+
+@pytest.mark.parametrize(
+    ("command", "axis"),
+    [
+        ("dpc prepare depth my_videos --fov 60", 1),
+        ("dpc prepare msraction3d RAW", 1),
+        ("dpc generate4d export s.h5 --as clouds", 1),
+        ("dpc prepare kitti-sf RAW --coordinates camera", 1),
+        ("dpc prepare synthetic articulated --view single", 2),
+        ("dpc prepare clouds scans/depth", 2),
+        ("dpc prepare kitti-det RAW", -1),
+    ],
+)
+def test_what_stands_is_drawn_standing_with_its_head_up(command: str, axis: int, tmp_path: Path) -> None:
+    """The head, part 0, lies at y = -1 in camera axes (1), at y = 1 in KITTI's (-1), and at z = 1 in those of rooms (2)."""
+    body = np.random.default_rng(0).uniform(-0.2, 0.2, (400, 3))
+    body[:, abs(axis)] = np.linspace(-1, 1, 400)
+    head = body[:, abs(axis)] * (-1 if axis == 1 else 1) > 0
+    body = CloudSequence.from_frames("who", [body], part=[np.where(head, 0, 1)])
+    parts_picture(
+        tmp_path / "a.png", [body], look=usual_look([{"command": command}, {"command": "dpc segment predict"}])
+    )
+    cell = np.asarray(Image.open(tmp_path / "a.png"))[30:230, 8:208].astype(int)
+    rows, columns = np.nonzero((cell < 240).any(-1))
+    assert np.ptp(rows) > 2 * np.ptp(columns)
+    blue, orange = (np.nonzero(cell[..., 2] - cell[..., 0] > 40)[0], np.nonzero(cell[..., 0] - cell[..., 2] > 40)[0])
+    assert blue.mean() < orange.mean() - 40
 
 
 def test_odd_sequences_are_drawn(tmp_path: Path) -> None:

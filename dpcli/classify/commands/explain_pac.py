@@ -72,7 +72,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     with input_file(task.data) as path, output_file(task.output) as place:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
-        axes = parse_view(settings.view or default_view(reader.length_unit))
+        axes = parse_view(settings.view or default_view(reader.length_unit, reader.provenance))
         pool = _pool(reader, request.samples, task, info)
         sequences = chosen_samples(reader, request.samples, pool)
         source = task.clips(reader, sequences, info)

@@ -20,8 +20,8 @@ SWEEPS = {  # setting -> title, values, the thesis's choice
     "temporal_weight": ("weight of temporal preservation", (1, 10, 100), 10),
 }
 _SCORES = {  # title -> where evaluate video has it
-    "PSNR new views": ("per_role", "test", "psnr"),
-    "SSIM new views": ("per_role", "test", "ssim"),
+    "PSNR novel views": ("per_role", "test", "psnr"),
+    "SSIM novel views": ("per_role", "test", "ssim"),
     "parts, ARI": ("parts", "adjusted_rand_index"),
     "parts found": ("counts", "parts", "discovered"),
 }

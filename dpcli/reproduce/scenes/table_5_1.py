@@ -119,7 +119,7 @@ def table(scores: dict[str, list[dict]], side: str) -> str:
     sides = [("per_role", "test", name) for name in PICTURES]
     titles = "PSNR | PSNR on object | SSIM | IoU | LPIPS | FVD | FID-VID | CLIP | input PSNR | parts ARI | tracks, % | F-score at 2 %"
     lines = [
-        f"Input {side}, {max(map(len, scores.values()))} clips; the first four columns: unseen sides.",
+        f"Input {side}, {max(map(len, scores.values()))} clips; the first four columns: novel views.",
         "",
         f"| row | {titles} |",
         "|---" * 13 + "|",

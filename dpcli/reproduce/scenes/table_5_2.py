@@ -80,7 +80,7 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
     lines = [
         f"Means over {clips} clips; views that no fit sees. Thesis: its own data, reference view.",
         "",
-        "| row | PSNR new views | SSIM new views | PSNR reference | parts, ARI | tracks, EPE / diameter | thesis PSNR | thesis SSIM |",
+        "| row | PSNR novel views | SSIM novel views | PSNR reference | parts, ARI | tracks, EPE / diameter | thesis PSNR | thesis SSIM |",
         "|---|---|---|---|---|---|---|---|",
     ]
     thesis = {row["method"].split()[-1]: row["values"] for row in runs.thesis_rows("5.2")}

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.view import upright_axis
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import file_names, first_names
 from dpcli.runtime import provenance
@@ -86,7 +87,7 @@ def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture
                     f"part {child} on part {parent} of {sequence.name}" for child, parent in unseen_motions(tree, kinds)
                 ]
             if picture is not None and number == 0:
-                joints_picture(picture, tree, sequence.name)
+                joints_picture(picture, tree, sequence.name, upright_axis(reader.provenance))
             yield index, sequence, tree
             progress.advance()
     if late:

@@ -297,13 +297,13 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
     if drawings == Drawings():
         return
     from dpcli.draw.ply import write_ply_frames
-    from dpcli.segment.pictures import parts_picture, turntable
+    from dpcli.segment.pictures import parts_picture, turntable, usual_look
     from dpcli.segment.scene.report import picture_of_scene
 
     with PartsReader(target) as reader:
         if drawings.picture is not None:
             shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
-            sequences, look = [reader.read(int(i)) for i in shown], None
+            sequences, look = [reader.read(int(i)) for i in shown], usual_look(reader.provenance)
             if scene:
                 sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
                 look = looks[0]
@@ -311,7 +311,7 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
             if len(shown) < len(reader):
                 log.info(f"{drawings.picture}: shows {len(shown)} of {len(reader)} sequences, evenly chosen")
         if drawings.turntable is not None:
-            turntable(drawings.turntable, reader.read(0))
+            turntable(drawings.turntable, reader.read(0), look=usual_look(reader.provenance, 320))
         if drawings.ply is not None:
             for index, name in enumerate(file_names(reader.names)):
                 write_ply_frames(drawings.ply / name, reader.read(index))

@@ -19,8 +19,11 @@ _INK, _PAPER = (30, 34, 42), (255, 255, 255)
 _HALF = 0.28  # of the object's extent: half the length of a drawn axis
 
 
-def joints_picture(path: Path, tree: KinematicTree, title: str) -> None:
-    """Writes two views of the parts as in frame 0, each joint's axis as a line (revolute) or an arrow (prismatic)."""
+def joints_picture(path: Path, tree: KinematicTree, title: str, up: str) -> None:
+    """Writes two views of the parts as in frame 0, each joint's axis as a line (revolute) or an arrow (prismatic).
+
+    up: the axis that points upwards, such as z or -y.
+    """
     from PIL import Image, ImageDraw
 
     points, part = np.concatenate(tree.points), np.repeat(tree.trajectories.ids, [len(own) for own in tree.points])
@@ -29,7 +32,7 @@ def joints_picture(path: Path, tree: KinematicTree, title: str) -> None:
     draw = ImageDraw.Draw(sheet)
     write_line(draw, (8, 4), title, sheet.width - 16, _INK)
     for column, azimuth in enumerate(_VIEWS):
-        matrix = turntable_view(azimuth, np.radians(25), "z")
+        matrix = turntable_view(azimuth, np.radians(25), up)
         seen = points @ matrix.T
         low, high = seen.min(0), seen.max(0)
         extent = max(float((high - low)[:2].max()), 1e-9)

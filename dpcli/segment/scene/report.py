@@ -1,4 +1,4 @@
-"""Lines that tell a person what was found in scenes, to be checked against what he knows of them."""
+"""Lines that tell people what was found in scenes, to be checked against what they know of these."""
 
 from __future__ import annotations
 
