@@ -190,21 +190,11 @@ def _make_plain(path: Path, tree: Any) -> None:
     for origin in root.iter("origin"):
         if origin.get("quat_xyzw"):
             origin.set("rpy", " ".join(map(repr, _roll_pitch_yaw(path, origin.attrib.pop("quat_xyzw")))))
-    for shape in root.findall("link/visual"):
-        link = shape.getparent().get("name")
-        count = sum(isinstance(one.tag, str) for one in shape.findall("geometry/*"))
-        if count == 0:
-            raise DataError(
-                f"{path}: link {link!r} has a <visual> without geometry; expected {', '.join(_SHAPES)} in it, or remove it"
-            )
-        if count > 1:
-            raise DataError(
-                f"{path}: link {link!r} has {count} shapes in one <visual>; give each a <visual> of its own"
-            )
     for shape in root.findall("link/collision"):
         kinds = [part.tag for part in shape.findall("geometry/*") if isinstance(part.tag, str)]
         if not kinds or not {*kinds} <= {*_SHAPES}:
             shape.getparent().remove(shape)
+    _check_visuals(path, root)
     _check_texts(path, root)
 
 
@@ -228,6 +218,21 @@ def _remove_unread(root: Any) -> None:
     for limit in root.iter("limit"):
         for name in {*limit.attrib} - {"lower", "upper"}:
             del limit.attrib[name]
+
+
+def _check_visuals(path: Path, root: Any) -> None:
+    """Raises DataError that names the link of a <visual> without a shape, or with several."""
+    for shape in root.findall("link/visual"):
+        link = shape.getparent().get("name")
+        count = sum(isinstance(one.tag, str) for one in shape.findall("geometry/*"))
+        if count == 0:
+            raise DataError(
+                f"{path}: link {link!r} has a <visual> without geometry; expected {', '.join(_SHAPES)} in it, or remove it"
+            )
+        if count > 1:
+            raise DataError(
+                f"{path}: link {link!r} has {count} shapes in one <visual>; give each a <visual> of its own"
+            )
 
 
 def _check_texts(path: Path, root: Any) -> None:

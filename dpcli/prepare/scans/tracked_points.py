@@ -134,7 +134,6 @@ class TrackedViews(OwnScans):
 
     @cached_property
     def fields(self) -> tuple[str, ...]:
-        """Returns the optional fields that the sample has."""
         with ViewsReader(self.raw) as views:
             return ("time", *views.fields)
 

@@ -224,23 +224,8 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
             f"{options.mask}: every mask covers its whole picture, so nothing is cut out; the background has to be black, or "
             "label 0 (the whole picture: --background keep)"
         )
-    if cut_off:
-        log.warn(f"{frames.path}: the object leaves the picture in {_named(frames, cut_off)}; what is cut off is lost")
-    if 2 * len(apart) > len(good):
-        log.warn(
-            f"{frames.path}: several objects apart in {_named(frames, apart)}; everything after this takes them for one."
-            " Cut one out with --mask FOLDER"
-        )
-    if 2 * len(dark) > len(good):
-        log.warn(
-            f"{frames.path}: colors fade to black with the alpha in {_named(frames, dark)}, as those that were multiplied by it; they"
-            " are taken as they are, so the outline will be dark; export straight (unassociated) alpha"
-        )
-    if cutter.options.holes == "auto" and any(cutter.gaps.values()):
-        count = sum(gap > 0 for gap in cutter.gaps.values())
-        log.info(
-            f"{frames.path}: gaps in the object are see-through in {counted(count, 'frame')} (--holes keep fills them)"
-        )
+    half = len(good) / 2
+    _tell_doubts(cutter, cut_off, apart if len(apart) > half else [], dark if len(dark) > half else [])
     if len(good) == 1:
         log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
     crop = crop_around(union(boxes), options.border) if options.crops else whole_picture(width, height)
@@ -253,6 +238,28 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         f"square of {crop.side} at ({crop.left}, {crop.top})"
     )
     return cutter, good, crop, (width, height)
+
+
+def _tell_doubts(cutter: Cutter, cut_off: list[int], apart: list[int], dark: list[int]) -> None:
+    """Warns of the frames in which the object is cut off, lies in pieces apart, or fades to black, and tells of its gaps."""
+    frames = cutter.frames
+    if cut_off:
+        log.warn(f"{frames.path}: the object leaves the picture in {_named(frames, cut_off)}; what is cut off is lost")
+    if apart:
+        log.warn(
+            f"{frames.path}: several objects apart in {_named(frames, apart)}; everything after this takes them for one."
+            " Cut one out with --mask FOLDER"
+        )
+    if dark:
+        log.warn(
+            f"{frames.path}: colors fade to black with the alpha in {_named(frames, dark)}, as those that were multiplied by it; they"
+            " are taken as they are, so the outline will be dark; export straight (unassociated) alpha"
+        )
+    if cutter.options.holes == "auto" and any(cutter.gaps.values()):
+        count = sum(gap > 0 for gap in cutter.gaps.values())
+        log.info(
+            f"{frames.path}: gaps in the object are see-through in {counted(count, 'frame')} (--holes keep fills them)"
+        )
 
 
 def _how(cutter: Cutter) -> str:
