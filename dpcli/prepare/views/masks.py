@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,9 @@ def _of_colors(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
     """Returns the mask u8 (H,W) of colors u8 (H,W,3): by their brightest channel, where they tell labels apart."""
     brightest = values.max(axis=2)
     if int(np.ptp(values, axis=2).max(initial=0)) > _COLORFUL:
+        if not lossy:
+            colors = values.astype(np.int64) @ [1 << 16, 1 << 8, 1]
+            _tell_several(path, np.unique(colors[_among_equals(colors) & (brightest > 0)]))
         return _opaque(brightest > (_half_of_lowest(brightest) if lossy else 0))
     if brightest.max(initial=0) < _SMALL_LABEL:
         return _of_values(path, brightest, lossy)
@@ -136,7 +140,18 @@ def _opaque_labels(path: Path, labels: np.ndarray) -> np.ndarray:
                 f"{path.parent}: masks: {void} beside {beside} is read as the object, like every label but 0; "
                 "where it means undecided, write 0"
             )
+    _tell_several(path, found - {void})
     return _opaque(labels > 0)
+
+
+def _tell_several(path: Path, labels: Sized) -> None:
+    """Says once of a folder that labels, of which there may be several, are taken together."""
+    if 1 < len(labels) <= _LABELS:
+        with log.each_once(_SAID):
+            log.info(
+                f"{path.parent}: masks: several labels in a picture are read as one object; where they are several objects, write"
+                " 0 in place of all but one"
+            )
 
 
 def _are_labels(values: np.ndarray) -> bool:
@@ -148,10 +163,15 @@ def _are_labels(values: np.ndarray) -> bool:
     between = (values > 0) & (values != max(few[-1], 255))
     if len(few) > _LABELS or not between.any():
         return len(few) == 2 and 255 < few[-1] < 65535
+    return float((_among_equals(values) & between).sum()) > 0.25 * float(between.sum())
+
+
+def _among_equals(values: np.ndarray) -> np.ndarray:
+    """Returns bool (H,W): whether a pixel and its eight neighbors have the same value, of whole numbers (H,W)."""
     cv2 = load_cv2()
-    numbers, square = np.searchsorted(few, values).astype(np.uint16), np.ones((3, 3), np.uint8)
-    alike = cv2.erode(numbers, square) == cv2.dilate(numbers, square)
-    return float((alike & between).sum()) > 0.25 * float(between.sum())
+    numbers = np.searchsorted(np.unique(values), values).astype(np.float32)  # which OpenCV takes, and exact
+    square = np.ones((3, 3), np.uint8)
+    return cv2.erode(numbers, square) == cv2.dilate(numbers, square)
 
 
 def _are_compressed_labels(values: np.ndarray) -> bool:

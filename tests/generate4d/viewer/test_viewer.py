@@ -155,6 +155,7 @@ def test_the_page_needs_nothing_from_outside(page):
     text = page.read_text(encoding="utf-8")
     assert "default-src 'none'" in text and "<title>A &lt;toy&gt; &amp; more</title>" in text
     assert not re.search(r"https?://|src=|@import|<link", text)
+    assert "<noscript>" in text  # as in a preview of a mail's attachment
     assert text.count("</script>") == 3  # what a command says can't end a script
     header = json.loads(re.search(r'id="header">(.*?)</script>', text, re.S)[1])
     assert header["history"][0]["command"].endswith("</script>") and header["metrics"] == {"psnr": 31.5}

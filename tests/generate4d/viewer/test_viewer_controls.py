@@ -151,7 +151,9 @@ def test_a_drag_coasts_and_turning_by_itself_goes_on(page, tmp_path):
 @needs_browser
 def test_keys_do_what_the_list_says(page, tmp_path):
     script = """
-      const seen = {};
+      const seen = {}, before = app.state.radius;
+      $("canvas").dispatchEvent(new WheelEvent("wheel", { deltaY: -100 * Math.log(2), ctrlKey: true, cancelable: true }));
+      seen.pinched = before / app.state.radius;
       for (const key of ["4", "t", "o", "p", "?"]) press(key);
       for (const key of ["ArrowRight", "ArrowUp", "ArrowUp"]) press(key, { shiftKey: true });
       Object.assign(seen, app.state);
@@ -169,6 +171,7 @@ def test_keys_do_what_the_list_says(page, tmp_path):
       return { ...seen, saved };"""
     seen = _run(page, script, tmp_path, "time=0.1&play=0&azimuth=0&elevation=0")
     assert np.rad2deg([seen["azimuth"], seen["elevation"]]) == pytest.approx([5, 10]) and seen["time"] == 0.1
+    assert seen["pinched"] == pytest.approx(2)  # a pinch of a trackpad to twice the size
     assert seen["contrast"] == ["none", "none"]  # else high contrast takes their colors away
     assert (seen["color"], seen["bounce"], seen["input"], seen["panel"], seen["trails"]) == (
         "depth",

@@ -543,6 +543,24 @@ def test_numbers_of_a_palette_are_labels_unless_its_colors_say_otherwise(tmp_pat
     np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((LABELS > 0) | whole, 255, 0))
 
 
+@pytest.mark.parametrize(
+    ("image", "several"),
+    [
+        pytest.param(with_palette(LABELS, BLACK, RED, GREEN), True, id="palette"),
+        pytest.param(colors_of(RED, GREEN), True, id="colors"),
+        pytest.param(Image.fromarray(LABELS), True, id="numbers"),
+        pytest.param(with_palette(LABELS > 0, BLACK, RED), False, id="one of a palette"),
+        pytest.param(colors_of(RED, RED).filter(ImageFilter.BoxBlur(1)), False, id="one color with a soft outline"),
+        pytest.param(Image.fromarray((LABELS > 0).astype(np.uint8) * 255), False, id="one mask"),
+    ],
+)
+def test_labels_that_are_taken_together_are_told(tmp_path, capfd, image, several):
+    """As of a rider and a horse, which touch."""
+    image.save(tmp_path / "m.png")
+    read_mask(tmp_path / "m.png")
+    assert ("several labels in a picture are read as one object" in capfd.readouterr().err) is several
+
+
 def test_labels_in_a_webp_without_loss_are_labels(tmp_path):
     for name, words in (("a.webp", {}), ("b.webp", {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"})):
         Image.fromarray(LABELS).convert("RGB").save(tmp_path / name, lossless=True, **words)

@@ -23,6 +23,7 @@ function ready() {
 }
 
 async function unpacked(text, bytes) {
+  if (!window.DecompressionStream) throw new Error("this browser is older than May 2023; open the page in a newer one");
   const letters = atob(text.trim()), packed = new Uint8Array(letters.length);
   for (let i = 0; i < packed.length; i++) packed[i] = letters.charCodeAt(i);  // `Uint8Array.from` takes 20 times as long
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));

@@ -119,7 +119,10 @@ class Stage extends Player {
       if (!pointers.size) this.letGo(event.timeStamp);
       canvas.classList.toggle("moving", pointers.size > 0);
     });
-    canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.zoom(Math.exp(event.deltaY * 0.001)); }, { passive: false });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY * (event.ctrlKey ? 0.01 : 0.001)));  // browsers tell a pinch of a trackpad by 100 log(scale), with ctrl
+    }, { passive: false });
     canvas.addEventListener("dblclick", (event) => this.pointedAt(event.offsetX, event.offsetY));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     new ResizeObserver(() => this.fitCanvas()).observe(canvas);

@@ -9,10 +9,11 @@ from dpcli.evaluate.video.sources.media import ArraySource, FolderSource, VideoS
 from dpcli.evaluate.video.sources.source import Source
 from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.regular_files import why_unreadable
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES
 from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES
 from dpcli.store import file_kind
 
-_CLIPS = (*VIDEO_SUFFIXES, ".gif", ".apng", ".png", ".webp", ".avif")
+_CLIPS = (*VIDEO_SUFFIXES, ".gif", ".apng", *IMAGE_SUFFIXES)
 _EXPECTED = "expected a views or gaussians file, a folder of images, an .npy array, or a video file"
 
 

@@ -235,12 +235,14 @@ def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
     (tmp_path / "bad.mp4").write_bytes(b"not a film")
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
     np.save(tmp_path / "ints.npy", np.zeros((2, 8, 8, 3), np.int32))
+    Image.new("RGB", (8, 8)).save(tmp_path / "one.jpg")
     for name, what in (
         ("empty", "no images"),
         ("bad", "not a readable image"),
         ("bad.mp4", "not a readable video"),
         ("bad.npy", "not a readable .npy"),
         ("ints.npy", "int32"),
+        ("one.jpg", "one image; expected its folder"),
         ("absent.h5", "no such file"),
     ):
         with pytest.raises(DataError, match=what):
