@@ -66,10 +66,7 @@ class Trainer:
 
     def run(self) -> None:
         """Trains from wherever the folder's state says to the end of the dynamic stage; does nothing when it is there."""
-        state = self.folder.load_state()
-        if state is not None:
-            with self.folder.restoring():
-                self._restore(state)
+        self.folder.resume(self._restore)
         if self.stage == 2:
             return
         for stage in range(self.stage, 2):

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dpcli.ops.open3d_import import load_open3d
+from dpcli.segment.thinning import thin_evenly
 
 _MOST = 20_000  # points that a surface is made of
 _REACH = 3.0  # of an alpha shape's balls, in distances between neighboring points: wide enough to close, thin enough for holes
@@ -17,8 +18,7 @@ def part_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     An alpha shape (Edelsbrunner & Mücke 1994); where that has no triangle, the convex hull; where the points lie in a plane
     or are fewer than four, a small tetrahedron about their middle, so that every link has a shape.
     """
-    if len(points) > _MOST:
-        points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
+    points = thin_evenly(points, _MOST)
     middle = points.mean(0)  # far from the origin Open3D's tetrahedra lose their shape
     points = np.unique(points - middle, axis=0)
     spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1])) if len(points) > 1 else 0.0
