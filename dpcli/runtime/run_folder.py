@@ -81,10 +81,7 @@ def take_state(trainer: object, names: Sequence[str], state: dict[str, Any]) -> 
     """Gives a trainer the named attributes that `state_of` returned."""
     for name in names:
         own = getattr(trainer, name)
-        if hasattr(own, "load_state_dict"):
-            own.load_state_dict(state[name])
-        else:
-            setattr(trainer, name, state[name])
+        own.load_state_dict(state[name]) if hasattr(own, "load_state_dict") else setattr(trainer, name, state[name])
 
 
 class RunFolder:
