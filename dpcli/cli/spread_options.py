@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,28 +12,17 @@ from dpcli.cli.help_groups import RUNNING
 if TYPE_CHECKING:
     from dpcli.runtime.machines.spread import Spread
 
-Shard = Annotated[
-    str,
-    typer.Option(
-        "--shard",
-        metavar="I/N",
-        rich_help_panel=RUNNING,
-        help="Only every Nth sample, starting at I (0 to N-1); dpc prepare merge joins the shards.",
-    ),
-]
+
+def _shard_of(items: str, joined: str) -> Any:
+    what = f"Only every Nth {items}, starting at I (0 to N-1); {joined}."
+    return typer.Option("--shard", metavar="I/N", rich_help_panel=RUNNING, help=what)
+
+
+Shard = Annotated[str, _shard_of("sample", "dpc prepare merge joins the shards")]
 Dask = Annotated[
     str,
     typer.Option(
         "--dask", metavar="ADDRESS", rich_help_panel=RUNNING, help="Work on a Dask cluster: tcp://HOST:PORT, or local."
-    ),
-]
-EachClip = Annotated[
-    str,
-    typer.Option(
-        "--shard",
-        metavar="I/N",
-        rich_help_panel=RUNNING,
-        help="Only every Nth clip, starting at I (0 to N-1); each scene is a file, so nothing has to be joined.",
     ),
 ]
 
@@ -67,4 +56,4 @@ class SpreadOptions:
 class SpreadClips(SpreadOptions):
     """Says who works on which clips, each of which becomes a file of its own."""
 
-    shard: EachClip = ""
+    shard: Annotated[str, _shard_of("clip", "each scene is a file, so nothing has to be joined")] = ""

@@ -43,6 +43,11 @@ class Resampling:
         if self.resamples < 0 or 0 < self.resamples < 100:
             raise UsageError(f"--resamples {self.resamples}: expected 100 or more, or 0 for no intervals")
 
+    @property
+    def title(self) -> str:
+        """Returns what tables call the intervals, such as `95 % interval`."""
+        return f"{100 * self.confidence:.4g} % interval"
+
     def intervals(self, metric: WeightedMetric, samples: int) -> dict[str, Interval]:
         """Returns the interval of each metric over `samples` samples; no intervals when `resamples` is 0."""
         if self.resamples == 0:
@@ -89,6 +94,15 @@ def means_of_samples(values: Mapping[str, np.ndarray]) -> WeightedMetric:
     """Returns the metrics that are a mean over the samples: f64 (n) by metric; NaN = the sample doesn't count for it."""
     defined = {key: ~np.isnan(value) for key, value in values.items()}
     return ratios_of_sums({key: np.nan_to_num(value) for key, value in values.items()}, defined)
+
+
+def values_of_all(metric: WeightedMetric, samples: int) -> dict[str, float]:
+    """Returns the value of each metric where each of `samples` samples counts once.
+
+    >>> values_of_all(means_of_samples({"mean": np.arange(4.0)}), 4)
+    {'mean': 1.5}
+    """
+    return {key: float(value[0]) for key, value in metric(np.ones((1, samples))).items()}
 
 
 def drawn_counts(
@@ -140,7 +154,7 @@ def bootstrap(
     >>> ends.low < 4.5 < ends.high
     True
     """
-    estimate = {key: float(value[0]) for key, value in metric(np.ones((1, samples))).items()}
+    estimate = values_of_all(metric, samples)
     if samples < 2:
         return {key: Interval(np.nan, np.nan) for key in estimate}
     found = replicates(metric, samples, rng, resamples)

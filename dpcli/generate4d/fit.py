@@ -42,10 +42,7 @@ class FitRun:
 
         Raises DpcError when the loss is no longer finite, Stopped after a signal, once the state is saved.
         """
-        state = self.folder.load_state()
-        if state is not None:
-            self._restore(state)
-        else:
+        if self.folder.resume(self._restore) is None:
             self._start()
         self._counted = time.monotonic()
         with Progress("fit", self.steps, "step") as bar:
@@ -72,9 +69,8 @@ class FitRun:
             self.preview(self.optimizer.model)
 
     def _restore(self, state: dict) -> None:
-        with self.folder.restoring():
-            self.seconds, self.recent = state["spent"], state["recent"]
-            self.optimizer.restore(state)
+        self.seconds, self.recent = state["spent"], state["recent"]
+        self.optimizer.restore(state)
 
     def _is_kept(self, step: int) -> bool:
         """Returns whether the model after this step is drawn or saved."""

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import torch
 
@@ -68,6 +69,19 @@ def diverged(problem: str, where: str, remedy: str) -> DpcError:
     return DpcError(
         f"training diverged ({where}): {problem}.\nStart another -o{remedy}, or look at the data (dpc info FILE)"
     )
+
+
+def state_of(trainer: object, names: Sequence[str]) -> dict[str, Any]:
+    """Returns what a saved state holds of the named attributes of a trainer: of networks and optimizers, their own state."""
+    found = {name: getattr(trainer, name) for name in names}
+    return {name: value.state_dict() if hasattr(value, "state_dict") else value for name, value in found.items()}
+
+
+def take_state(trainer: object, names: Sequence[str], state: dict[str, Any]) -> None:
+    """Gives a trainer the named attributes that `state_of` returned."""
+    for name in names:
+        own = getattr(trainer, name)
+        own.load_state_dict(state[name]) if hasattr(own, "load_state_dict") else setattr(trainer, name, state[name])
 
 
 class RunFolder:
@@ -214,6 +228,14 @@ class RunFolder:
             raise DataError(
                 f"{self.path / 'state.pt'}: the saved state is damaged ({said or type(error).__name__}); --force starts over"
             ) from None
+
+    def resume(self, restore: Callable[[dict], None]) -> dict | None:
+        """Gives what an earlier run saved to `restore` and returns it; None for a fresh run. Raises as `load_state` and `restoring`."""
+        state = self.load_state()
+        if state is not None:
+            with self.restoring():
+                restore(state)
+        return state
 
     def tell_continuing(self, where: str | None) -> None:
         """Says where an earlier run goes on; None: at its end."""

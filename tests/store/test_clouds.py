@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
 import pickle
 import subprocess
@@ -19,6 +18,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader, ScoresReader, file_kind
+from tests.support.hdf5_edits import edit, replacing
 
 
 def write(path: Path, sequences: list[CloudSequence], **options) -> Path:
@@ -31,10 +31,6 @@ def write(path: Path, sequences: list[CloudSequence], **options) -> Path:
 @pytest.fixture
 def three(make_sequence) -> list[CloudSequence]:
     return [make_sequence(f"s{i}", seed=i, frames=4 + i, label=i, split="train", subject=i) for i in range(3)]
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_round_trip_of_every_field(tmp_path, make_sequence):
@@ -85,7 +81,7 @@ def test_reads_only_the_frames_asked_for(tmp_path, three, monkeypatch):
 
 
 def test_equal_work_gives_equal_bytes(tmp_path, three):
-    assert digest(write(tmp_path / "a.h5", three)) == digest(write(tmp_path / "b.h5", three))
+    assert file_digest(write(tmp_path / "a.h5", three)) == file_digest(write(tmp_path / "b.h5", three))
 
 
 def test_stopped_part_continues_to_identical_bytes(tmp_path, three):
@@ -100,7 +96,7 @@ def test_stopped_part_continues_to_identical_bytes(tmp_path, three):
         assert writer.written_names == ["s0"]
         for sequence in three[1:]:
             writer.write(sequence)
-    assert digest(path) == digest(whole)
+    assert file_digest(path) == file_digest(whole)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["stopped.h5", "whole.h5"]
 
 
@@ -129,10 +125,10 @@ def test_an_error_leaves_nothing_behind(tmp_path, three):
 
 def test_existing_file_is_kept_without_force(tmp_path, three):
     path = write(tmp_path / "a.h5", three)
-    before = digest(path)
+    before = file_digest(path)
     with pytest.raises(UsageError, match="--force"):
         write(path, three[:1])
-    assert digest(path) == before
+    assert file_digest(path) == before
 
 
 def _bad(sequence: CloudSequence, **changes) -> CloudSequence:
@@ -240,37 +236,24 @@ def test_several_workers_read_what_one_reads(tmp_path, three):
     assert [np.array_equal(a.points, b.points) for a, b in zip(found, three, strict=True)] == [True] * 3
 
 
-def _edit(path: Path, change) -> None:
-    with h5py.File(path, "r+") as file:
-        change(file)
-
-
-def _replace(name: str, value) -> object:
-    def change(file):
-        del file[name]
-        file[name] = value
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda f: f.attrs.update(dpc_kind="scores"), "holds 'scores', expected 'clouds'"),
         (lambda f: f.attrs.update(dpc_schema=9), "schema 9"),
         (lambda f: f.attrs.__delitem__("dpc_kind"), "not one of dpc's"),
-        (_replace("frame_offsets", np.array([0, 5, 3])), "start at 0 and never fall"),
-        (_replace("sequence_offsets", np.array([0, 99])), "99"),
-        (_replace("label", np.array([0, 1, 5], np.int32)), "label 5 of 's2', but 3 classes"),
+        (replacing("frame_offsets", np.array([0, 5, 3])), "start at 0 and never fall"),
+        (replacing("sequence_offsets", np.array([0, 99])), "99"),
+        (replacing("label", np.array([0, 1, 5], np.int32)), "label 5 of 's2', but 3 classes"),
         (lambda f: f.__delitem__("points"), "'points' is missing"),
-        (_replace("points", h5py.ExternalLink("other.h5", "/points")), "link to elsewhere"),
-        (_replace("points", h5py.SoftLink("/label")), "link to elsewhere"),
+        (replacing("points", h5py.ExternalLink("other.h5", "/points")), "link to elsewhere"),
+        (replacing("points", h5py.SoftLink("/label")), "link to elsewhere"),
     ],
 )
 def test_files_that_break_the_contract_are_refused(tmp_path, three, change, message):
     path = write(tmp_path / "a.h5", three)
     CloudsReader(path).close()
-    _edit(path, change)
+    edit(path, change)
     with pytest.raises(DataError, match=message):
         CloudsReader(path)
 
@@ -284,7 +267,7 @@ def test_virtual_and_external_data_are_refused(tmp_path, three):
         del file["points"]
         file.create_virtual_dataset("points", layout)
 
-    _edit(path, virtual)
+    edit(path, virtual)
     with pytest.raises(DataError, match="keeps its data in another file"):
         CloudsReader(path)
 
@@ -306,7 +289,7 @@ def test_nan_in_a_file_is_found_when_read(tmp_path, three):
         def poison(file, value=value):
             file["points"][3, 1] = value
 
-        _edit(path, poison)
+        edit(path, poison)
         with pytest.raises(DataError, match="coordinates of NaN, infinity or a number beyond"):
             CloudsReader(path).read(0)
     CloudsReader(path).read(1)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import pickle
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,8 +14,10 @@ from typer.testing import CliRunner
 
 from dpcli.cli.app import app
 from dpcli.errors import DataError, Stopped, UsageError
+from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, PartsReader, PartsWriter, file_kind
 from dpcli.store.summary import summary
+from tests.support.hdf5_edits import edit, replacing
 from tests.support.parts_helpers import CHAIN, perfect, rigid, truth_sequence, write_parts
 
 K = 4
@@ -28,10 +28,6 @@ def samples() -> list[tuple]:
     """Three sequences with three, no, and one pair."""
     pairs = [CHAIN, np.zeros((0, 2), np.int32), CHAIN[:1]]
     return [perfect(truth_sequence(f"s{i}", seed=i, label=i % 2), K, pairs[i]) for i in range(3)]
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def assert_holds(path: Path, samples: list[tuple]) -> None:
@@ -101,7 +97,7 @@ def test_a_reader_travels_to_another_process(tmp_path, samples):
 
 
 def test_equal_work_gives_equal_bytes(tmp_path, samples):
-    assert digest(write_parts(tmp_path / "a.h5", samples)) == digest(write_parts(tmp_path / "b.h5", samples))
+    assert file_digest(write_parts(tmp_path / "a.h5", samples)) == file_digest(write_parts(tmp_path / "b.h5", samples))
 
 
 @pytest.mark.parametrize("stop", [Stopped("now"), KeyboardInterrupt()])
@@ -116,7 +112,7 @@ def test_stopped_part_continues_to_identical_bytes(tmp_path, samples, stop):
         assert writer.written_names == ["s0"]
         for sample in samples[1:]:
             writer.write(*sample)
-    assert digest(path) == digest(whole)
+    assert file_digest(path) == file_digest(whole)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["stopped.h5", "whole.h5"]
 
 
@@ -140,7 +136,7 @@ def test_a_sample_cut_short_is_written_again(tmp_path, samples, monkeypatch, rea
         assert writer.written_names == ["s0"]
         for sample in samples[1:]:
             writer.write(*sample)
-    assert digest(path) == digest(whole)
+    assert file_digest(path) == file_digest(whole)
 
 
 def test_a_part_with_another_number_of_parts_stays_and_force_starts_over(tmp_path, samples):
@@ -215,34 +211,21 @@ def test_ids_beyond_the_slots_and_no_slots_are_refused(tmp_path, samples):
         PartsWriter(tmp_path / "a.h5", num_parts=0)
 
 
-def _edit(path: Path, change) -> None:
-    with h5py.File(path, "r+") as file:
-        change(file)
-
-
-def _replace(name: str, values: np.ndarray):
-    def change(file):
-        del file[name]
-        file[name] = values
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda f: f.__delitem__("part_probability"), "part_probability is missing"),
         (lambda f: f.__delitem__("part"), "'part' is missing"),
         (lambda f: f.__delitem__("flow_offsets"), "'flow_offsets' is missing"),
-        (_replace("part_probability", np.zeros((5, K), np.float32)), r"has shape \(5, 4\)"),
-        (_replace("pair_offsets", np.array([0, 3, 2, 4])), "never fall"),
-        (_replace("pair_offsets", np.array([0, 4])), "has 2 rows ending at 4, expected 4"),
-        (_replace("part_motion", np.zeros((1, K, 4, 4), np.float32)), "part_motion has 1 rows for 4 pairs"),
+        (replacing("part_probability", np.zeros((5, K), np.float32)), r"has shape \(5, 4\)"),
+        (replacing("pair_offsets", np.array([0, 3, 2, 4])), "never fall"),
+        (replacing("pair_offsets", np.array([0, 4])), "has 2 rows ending at 4, expected 4"),
+        (replacing("part_motion", np.zeros((1, K, 4, 4), np.float32)), "part_motion has 1 rows for 4 pairs"),
     ],
 )
 def test_a_damaged_layout_is_said_on_opening(tmp_path, samples, change, said):
     path = write_parts(tmp_path / "a.h5", samples)
-    _edit(path, change)
+    edit(path, change)
     with pytest.raises(DataError, match=said) as error:
         PartsReader(path)
     assert str(path) in str(error.value)
@@ -250,7 +233,7 @@ def test_a_damaged_layout_is_said_on_opening(tmp_path, samples, change, said):
 
 def test_damaged_values_are_said_when_read(tmp_path, samples):
     path = write_parts(tmp_path / "a.h5", samples)
-    _edit(path, lambda file: file["flow"].__setitem__(0, np.nan))
+    edit(path, lambda file: file["flow"].__setitem__(0, np.nan))
     reader = PartsReader(path)
     with pytest.raises(DataError, match=r"a\.h5: sample 's0': 1 of 123 points with NaN or infinite flow, the first"):
         reader.read_parts(0)

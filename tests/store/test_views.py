@@ -16,6 +16,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store import ViewsHeader, ViewsReader, ViewsWriter
 from dpcli.store.summary import summary
+from tests.support.hdf5_edits import edit, replacing
 
 
 def make_header(views: int = 3, frames: int = 4, size: tuple[int, int] = (6, 5)) -> ViewsHeader:
@@ -173,18 +174,13 @@ def test_broken_ground_truth_is_refused(tmp_path, truth, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def _reshape(file, name, values):
-    del file[name]
-    file[name] = values
-
-
 TAMPER = {
     "no rgba": (lambda f: f.__delitem__("rgba"), "'rgba' is missing"),
     "no role": (lambda f: f.__delitem__("role"), "'role' is missing"),
     "no reference": (lambda f: f.attrs.__delitem__("reference"), "'reference' is missing"),
-    "three channels": (lambda f: _reshape(f, "rgba", np.zeros((3, 4, 5, 6, 3), np.uint8)), "expected u8"),
-    "fewer frames": (lambda f: _reshape(f, "time", np.arange(3.0)), "frames = 3"),
-    "text times": (lambda f: _reshape(f, "time", np.array([b"a"] * 4)), "time"),
+    "three channels": (replacing("rgba", np.zeros((3, 4, 5, 6, 3), np.uint8)), "expected u8"),
+    "fewer frames": (replacing("time", np.arange(3.0)), "frames = 3"),
+    "text times": (replacing("time", np.array([b"a"] * 4)), "time"),
     "NaN pose": (lambda f: f["world_to_camera"].__setitem__((0, 0, 0), np.nan), "NaN"),
     "stretched pose": (lambda f: f["world_to_camera"].__setitem__((0, 0, 0), 2.0), "not a rotation"),
     "another kind": (lambda f: f.attrs.__setitem__("dpc_kind", "clouds"), "expected 'views'"),
@@ -196,8 +192,7 @@ def test_a_tampered_file_is_refused(tmp_path, name):
     path = write(tmp_path / "a.h5", make_header())
     ViewsReader(path)
     change, message = TAMPER[name]
-    with h5py.File(path, "r+") as file:
-        change(file)
+    edit(path, change)
     with pytest.raises(DataError, match=message):
         ViewsReader(path)
 

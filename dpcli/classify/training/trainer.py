@@ -25,18 +25,11 @@ from dpcli.classify.training.validation import validation_accuracy
 from dpcli.errors import DpcError, first_line
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.run_folder import RunFolder, state_of, take_state
 from dpcli.runtime.seeds import torch_seed
 from dpcli.runtime.signals import StopRequest
 
-_KEPT = (
-    "stage",
-    "epoch",
-    "step",
-    "best",
-    "sums",
-    "spent",
-)  # what a state holds of a trainer beside weights and optimizer
+_SAVED = ("stage", "epoch", "step", "best", "sums", "spent", "model")  # of a trainer, beside the optimizer
 
 
 class Trainer:
@@ -66,10 +59,7 @@ class Trainer:
 
     def run(self) -> None:
         """Trains from wherever the folder's state says to the end of the dynamic stage; does nothing when it is there."""
-        state = self.folder.load_state()
-        if state is not None:
-            with self.folder.restoring():
-                self._restore(state)
+        self.folder.resume(self._restore)
         if self.stage == 2:
             return
         for stage in range(self.stage, 2):
@@ -234,20 +224,13 @@ class Trainer:
     def _save_state(self, together: bool = True) -> None:
         """Saves all that a continued run needs. together: every process is here; none goes on, or ends, before it is safe."""
         if self.processes.first:
-            self.folder.save_state(
-                {
-                    **{key: getattr(self, key) for key in _KEPT},
-                    "model": self.model.state_dict(),
-                    "optimizer": self.optimize.optimizer.state_dict() if self.optimize is not None else None,
-                }
-            )
+            optimizer = None if self.optimize is None else self.optimize.optimizer.state_dict()
+            self.folder.save_state({**state_of(self, _SAVED), "optimizer": optimizer})
         if together:
             self.processes.wait()
 
     def _restore(self, state: dict) -> None:
-        for key in _KEPT:
-            setattr(self, key, state[key])
-        self.model.load_state_dict(state["model"])
+        take_state(self, _SAVED, state)
         if self.stage < 2 and state["optimizer"] is not None:
             if self.stage == 1:
                 self.model.freeze_static()

@@ -38,8 +38,7 @@ def predict(
     batch: Annotated[int, typer.Option(help="Clips at a time.")] = 8,
     segments: cutting.SegmentOptions,
     stream: streaming.StreamOptions,
-    hop: streaming.Hop = None,
-    window: streaming.Window = None,
+    windows: streaming.WindowOptions,
     reject_below: RejectBelow = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -55,14 +54,14 @@ def predict(
     if stream.stream:
         others = {"split": split != "auto", "segments": segments.segments, "shortest": segments.shortest is not None}
         streaming.refuse("--stream, which is one video, as it comes", others | batch_options)
-        streaming.predict_stream(task, stream, hop, window, reject_below)
+        streaming.predict_stream(task, stream, windows, reject_below)
         return
     streaming.require("--stream", follow=stream.follow, json=stream.json_output, page=stream.page)
     if segments.segments:
         streaming.refuse("--segments, which looks at every frame of a recording in order", batch_options)
-        cutting.predict_segments(task, hop, window, segments.shortest, reject_below)
+        cutting.predict_segments(task, windows, segments.shortest, reject_below)
         return
-    streaming.require("--stream or --segments", hop=hop, window=window)
+    streaming.require("--stream or --segments", **vars(windows))
     streaming.require("--segments", shortest=segments.shortest)
     if output is None:
         raise UsageError("Missing option '-o' / '--output'.")

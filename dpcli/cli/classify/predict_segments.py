@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
-from dpcli.cli.classify.predict_stream import PANEL
+from dpcli.cli.classify.predict_stream import PANEL, WindowOptions
 from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,35 +18,29 @@ if TYPE_CHECKING:
 class SegmentOptions:
     """Says whether, and how, recordings are cut into actions."""
 
+    HEADING: ClassVar[str] = PANEL
     segments: Annotated[
-        bool,
-        typer.Option("--segments", rich_help_panel=PANEL, help="Cut long recordings into actions, as .csv or .json."),
+        bool, typer.Option("--segments", help="Cut long recordings into actions, as .csv or .json.")
     ] = False
     shortest: Annotated[
         int | None,
         typer.Option(
-            "--shortest",
-            min=1,
-            rich_help_panel=PANEL,
-            help="With --segments: least number of frames of an action. Default: a window.",
+            "--shortest", min=1, help="With --segments: least number of frames of an action. Default: a window."
         ),
     ] = None
 
 
-def predict_segments(
-    task: ModelTask, hop: int | None, window: int | None, shortest: int | None, reject: str | None
-) -> None:
+def predict_segments(task: ModelTask, windows: WindowOptions, shortest: int | None, reject: str | None) -> None:
     """Checks the options, cuts the recordings, and prints how many segments there are, or with `-o -` the table itself."""
     if task.output is None:
         raise UsageError("Missing option '-o' / '--output'.")
-    if hop is not None and hop < 1:
-        raise UsageError(f"--hop {hop}: expected at least 1 frame")
+    windows.check()
     from dpcli.classify.commands.segments import SegmentOptions as Options
     from dpcli.classify.commands.segments import predict_segments as run
     from dpcli.classify.commands.segments import segment_counts
     from dpcli.counted import counted
 
-    found, text = run(task, Options(hop, window, shortest, reject))
+    found, text = run(task, Options(windows.hop, windows.window, shortest, reject))
     if task.output == "-":
         typer.echo(text, nl=False)
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -18,50 +18,55 @@ if TYPE_CHECKING:
 
 PANEL = "Streams and long recordings"  # heading in the help
 
-Stream = Annotated[
-    bool,
-    typer.Option(
-        "--stream",
-        rich_help_panel=PANEL,
-        help="Predict while frames still arrive; DATA is then -, a growing file or a folder.",
-    ),
-]
-Hop = Annotated[
-    int | None,
-    typer.Option(
-        "--hop",
-        rich_help_panel=PANEL,
-        help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window.",
-    ),
-]
-Window = Annotated[
-    int | None,
-    typer.Option(
-        "--window",
-        rich_help_panel=PANEL,
-        help="With --stream or --segments: frames of a window, for models trained with --timing uniform.",
-    ),
-]
-Follow = Annotated[
-    float | None,
-    typer.Option(
-        "--follow",
-        rich_help_panel=PANEL,
-        help="With --stream: seconds to wait for more at the end of a file or folder. Default: 0.",
-    ),
-]
 
-Page = Annotated[
-    Path | None,
-    typer.Option(
-        "--page",
-        rich_help_panel=PANEL,
-        help="With --stream: write a page of the frames and predictions to this .html at the end.",
-    ),
-]
-JsonLines = Annotated[
-    bool, typer.Option("--json", rich_help_panel=PANEL, help="With --stream: one JSON object per line.")
-]
+@dataclass(frozen=True)
+class WindowOptions:
+    """Says which frames of a stream or a long recording each prediction looks at."""
+
+    HEADING: ClassVar[str] = PANEL
+    hop: Annotated[
+        int | None,
+        typer.Option(
+            "--hop",
+            help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window.",
+        ),
+    ] = None
+    window: Annotated[
+        int | None,
+        typer.Option(
+            "--window",
+            help="With --stream or --segments: frames of a window, for models trained with --timing uniform.",
+        ),
+    ] = None
+
+    def check(self) -> None:
+        """Raises UsageError for a hop of no frame."""
+        if self.hop is not None and self.hop < 1:
+            raise UsageError(f"--hop {self.hop}: expected at least 1 frame")
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """Says how a stream is read, predicted and shown."""
+
+    HEADING: ClassVar[str] = PANEL
+    stream: Annotated[
+        bool,
+        typer.Option("--stream", help="Predict while frames still arrive; DATA is then -, a growing file or a folder."),
+    ] = False
+    follow: Annotated[
+        float | None,
+        typer.Option(
+            "--follow", help="With --stream: seconds to wait for more at the end of a file or folder. Default: 0."
+        ),
+    ] = None
+    json_output: Annotated[bool, typer.Option("--json", help="With --stream: one JSON object per line.")] = False
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page", help="With --stream: write a page of the frames and predictions to this .html at the end."
+        ),
+    ] = None
 
 
 def require(mode: str, **given: object) -> None:
@@ -77,25 +82,12 @@ def refuse(reason: str, given: dict[str, bool]) -> None:
         raise UsageError(f"--{name} does not go with {reason}")
 
 
-@dataclass(frozen=True)
-class StreamOptions:
-    """Says how a stream is read, predicted and shown."""
-
-    stream: Stream = False
-    follow: Follow = None
-    json_output: JsonLines = False
-    page: Page = None
-
-
-def predict_stream(
-    task: ModelTask, given: StreamOptions, hop: int | None, window: int | None, reject: str | None
-) -> None:
+def predict_stream(task: ModelTask, given: StreamOptions, windows: WindowOptions, reject: str | None) -> None:
     """Checks the options and predicts: a line per prediction on stdout, or a view that changes in place on a terminal."""
     follow = given.follow
     if task.output == "-":
         raise UsageError("-o - would mix HDF5 with the lines on stdout; name a file, or leave -o out")
-    if hop is not None and hop < 1:
-        raise UsageError(f"--hop {hop}: expected at least 1 frame")
+    windows.check()
     if follow is not None and not follow >= 0:
         raise UsageError(f"--follow {follow:g}: expected seconds, 0 or more (inf: until a signal)")
     if given.page is not None:
@@ -104,7 +96,7 @@ def predict_stream(
     from dpcli.classify.commands.stream import predict_stream as run
     from dpcli.cli.classify.stream_listeners import listener
 
-    options = Options(hop or 1, window, follow or 0.0, cloud_files(), reject)
+    options = Options(windows.hop or 1, windows.window, follow or 0.0, cloud_files(), reject)
     run(task, options, lambda speaker: listener(speaker, given.json_output, given.page, task.source))
 
 

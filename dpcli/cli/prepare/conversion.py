@@ -76,19 +76,9 @@ def run_conversion(
     from dpcli.runtime.machines import shards
     from dpcli.runtime.progress import log
 
-    conversion = Conversion(
-        points=options.points,
-        sampling=options.sampling,
-        limit=options.limit,
-        compression=options.compression,
-        on_error=options.on_error,
-        jobs=options.jobs,
-        shard=shards.Shard.parse(options.shard) if options.shard else None,
-        seed=options.seed,
-        force=options.force,
-        task=f"prepare {name}",
-        item_seconds=options.item_seconds,
-    )
+    shared = {key: value for key, value in vars(options).items() if key not in ("output", "shard", "dask", "check")}
+    shard = shards.Shard.parse(options.shard) if options.shard else None
+    conversion = Conversion(**shared, shard=shard, task=f"prepare {name}")
     report = convert_raw_data(reader, options.output, conversion, options.dask)
     for line in report.lines():
         log.warn(line)

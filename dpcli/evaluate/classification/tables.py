@@ -53,12 +53,11 @@ def _calibration_note(report: ClassificationReport) -> str:
 
 def _stream_table(report: ClassificationReport) -> TextTable:
     top = report.main.top_accuracy is not None
-    interval = f"{100 * report.resampling.confidence:.4g} % interval"
     header = [
         "stream",
         "accuracy",
         "correct",
-        interval,
+        report.resampling.title,
         *([f"top-{report.main.top_k}"] if top else []),
         "balanced accuracy",
         "macro F1",
@@ -93,7 +92,7 @@ def _interval_tables(report: ClassificationReport) -> list[TextTable]:
     rows = [
         [title, *(percent_ends(own.get(key)) for own in report.intervals.values())] for key, title in titles.items()
     ]
-    return [TextTable(f"{100 * report.resampling.confidence:.4g} % intervals", ["metric", *report.intervals], rows)]
+    return [TextTable(f"{report.resampling.title}s", ["metric", *report.intervals], rows)]
 
 
 def _class_table(report: ClassificationReport) -> TextTable:

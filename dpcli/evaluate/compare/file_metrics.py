@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
+from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples, values_of_all
 from dpcli.evaluate.results import LeftOut, list_names
 
 
@@ -56,8 +56,8 @@ class FileMetrics:
 
     def values(self) -> dict[str, float]:
         """Returns the metrics of all samples together; NaN = undefined."""
-        found = self.metric(np.ones((1, len(self.names))))
-        return {key: float(found[key][0]) for key in self.units}
+        found = values_of_all(self.metric, len(self.names))
+        return {key: found[key] for key in self.units}
 
     def restricted(self, names: Sequence[str]) -> FileMetrics:
         """Returns the same of some of the samples, in the order of `names`."""

@@ -16,8 +16,8 @@ def compare_tables(report: CompareReport) -> list[TextTable]:
     """Returns for each task a table of the metrics, and one of the samples that changed most."""
     made = []
     for part in report.parts:
-        interval = f"{100 * report.resampling.confidence:.4g} % interval"
-        header = ["metric", "A", "B", "A - B", interval, "p", "A better", "B better", "equal", "Wilcoxon p"]
+        header = ["metric", "A", "B", "A - B", report.resampling.title, "p"]
+        header += ["A better", "B better", "equal", "Wilcoxon p"]
         rows = [_change_row(key, change) for key, change in part.changes.items()]
         of = counted(len(part.names), part.kind.removesuffix("s"))
         made.append(TextTable(f"{part.task.capitalize()}: A against B, {of}", header, rows))

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric, ratios_of_sums
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric, ratios_of_sums, values_of_all
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
 from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
-from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.results import LeftOut, measure_by_class
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences
 from dpcli.store import CloudSequence, CloudsReader
@@ -86,8 +85,8 @@ def evaluate_joints(
         paired.split,
         str(truth),
         paired.truth.length_unit,
-        joint_metrics([total]),
-        {label: joint_metrics([one]) for label, one in counts.items()},
+        joint_metrics(total),
+        {label: joint_metrics(one) for label, one in counts.items()},
         paired.truth.class_names,
         paired.left_out,
         names,
@@ -113,8 +112,8 @@ def _visibly(reader: CloudsReader, row: int, truth: CloudSequence) -> Callable[[
     return moves
 
 
-def _sums(found: Sequence[JointStatistics]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Returns numerator and denominator of each metric for each of the statistics, f64 (n)."""
+def _weighted(found: Sequence[JointStatistics]) -> WeightedMetric:
+    """Returns the metrics as functions of how often the statistics of each sequence count."""
     pairs = {
         "type": [(one.types, one.joints) for one in found],
         "axis_within_5": [(one.near, one.axes) for one in found],
@@ -127,14 +126,9 @@ def _sums(found: Sequence[JointStatistics]) -> tuple[dict[str, np.ndarray], dict
         "state_length": [(sum(one.slides), len(one.slides)) for one in found],
     }
     tops, bottoms = ({key: np.array(rows, np.float64)[:, side] for key, rows in pairs.items()} for side in (0, 1))
-    return tops, bottoms
+    return ratios_of_sums(tops, bottoms)
 
 
-def _weighted(found: Sequence[JointStatistics]) -> WeightedMetric:
-    return ratios_of_sums(*_sums(found))
-
-
-def joint_metrics(found: Sequence[JointStatistics]) -> dict[str, float]:
-    """Returns the metrics of statistics taken together; NaN where nothing counts."""
-    tops, bottoms = _sums(found)
-    return {key: float(divide(tops[key].sum(), bottoms[key].sum())) for key in METRICS}
+def joint_metrics(found: JointStatistics) -> dict[str, float]:
+    """Returns the metrics of statistics; NaN where nothing counts."""
+    return values_of_all(_weighted([found]), 1)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from dataclasses import dataclass
 from functools import cache
@@ -14,12 +13,12 @@ from typing import Any
 
 from dpcli.errors import DataError, UsageError
 from dpcli.regular_files import why_unreadable
+from dpcli.runtime.provenance import file_digest
 from dpcli.text_files import read_toml
 
 LIST = Path(__file__).with_name("weights.toml")
 FOLDER_VARIABLE = "DPC_WEIGHTS"
 _WHOLE = 64  # hexadecimal digits of a SHA-256
-_BLOCK = 1 << 20  # bytes
 
 
 @dataclass(frozen=True)
@@ -122,15 +121,6 @@ def bytes_text(count: int, about: bool = False) -> str:
     return f"{'about ' if about else ''}{count / per:.3g} {unit}"
 
 
-def sha256_of(path: Path) -> str:
-    """Returns the SHA-256 of a file, 64 hexadecimal digits."""
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            found.update(block)
-    return found.hexdigest()
-
-
 def check_file(path: Path, weights: Weights, digest: bool = True) -> Checked:
     """Compares a file with its entry: size, and (unless digest is False) as much of the SHA-256 as is published."""
     if not path.is_file():
@@ -142,7 +132,7 @@ def check_file(path: Path, weights: Weights, digest: bool = True) -> Checked:
         return Checked("damaged", "", "an empty file")
     if not digest:
         return Checked("present", "", "size not published" if weights.about else "size checked")
-    return _check_digest(sha256_of(path), weights)
+    return _check_digest(file_digest(path), weights)
 
 
 def _check_digest(found: str, weights: Weights) -> Checked:

@@ -22,8 +22,8 @@ def class_rows(main: Any, classes: Mapping[int, Any], names: list[str]) -> list[
 
 def interval_tables(report: Any, rows: list[list[str]]) -> list[TextTable]:
     """Returns a table of (metric, value, interval) over all sequences, as a list of one; none for a report without intervals."""
-    title = f"{100 * report.resampling.confidence:.4g} % interval"
-    return [TextTable("All sequences", ["metric", "value", title], rows)] if report.intervals else []
+    header = ["metric", "value", report.resampling.title]
+    return [TextTable("All sequences", header, rows)] if report.intervals else []
 
 
 def segmentation_tables(report: SegmentationReport) -> list[TextTable]:

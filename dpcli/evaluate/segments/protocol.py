@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, values_of_all
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.results import LeftOut, left_out, left_out_note, list_names, none_if_nan, report_json
 from dpcli.evaluate.segments.metrics import METRICS, OVERLAPS, RecordingCounts, count_recording, segments_weighted
@@ -54,8 +52,8 @@ def evaluate_segments(
         log.warn(f"{truth}: {doubt}")
     counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
     metric = segments_weighted(counts)
-    values = {key: float(value[0]) for key, value in metric(np.ones((1, len(counts)))).items()}
     intervals = resampling.intervals(metric, len(counts))
+    values = values_of_all(metric, len(counts))
     return SegmentsReport(names, counts, values, intervals, resampling, truth, others, predicted.provenance)
 
 
@@ -75,16 +73,18 @@ def _one_sided(predicted: Segments, true: Segments, names: Sequence[str], truth:
 
 def segments_tables(report: SegmentsReport) -> list[TextTable]:
     """Returns a table of the metrics of all recordings, and one with a row for each."""
-    title = f"{100 * report.resampling.confidence:.4g} % interval"
     rows = [[title_of(key), percent(report.metrics[key]), percent_ends(report.intervals.get(key))] for key in METRICS]
     single = [[name, *_row(one)] for name, one in zip(report.names, report.counts)]
     header = ["recording", "frames", "true segments", "predicted", *(title_of(key) for key in METRICS)]
-    return [TextTable("Segments", ["metric", "value", title], rows), TextTable("By recording", header, single)]
+    return [
+        TextTable("Segments", ["metric", "value", report.resampling.title], rows),
+        TextTable("By recording", header, single),
+    ]
 
 
 def _row(one: RecordingCounts) -> list[str]:
-    values = segments_weighted([one])(np.ones((1, 1)))
-    return [str(one.frames), str(one.true), str(one.predicted), *(percent(float(values[key][0])) for key in METRICS)]
+    values = values_of_all(segments_weighted([one]), 1)
+    return [str(one.frames), str(one.true), str(one.predicted), *(percent(values[key]) for key in METRICS)]
 
 
 def segments_notes(report: SegmentsReport) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling, means_of_samples
 from dpcli.evaluate.proportions import divide
+from dpcli.evaluate.video.sources.stored import draw_scene
 from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.runtime.progress import Progress
 from dpcli.runtime.seeds import generator
@@ -87,20 +88,11 @@ def visible_points(scene: GaussianScene, time: float, around: np.ndarray) -> np.
 
     The depth of a pixel is the mean of the Gaussians that make it, weighted as their colors are.
     """
-    import torch
-
-    from dpcli.ops.splatting.rasterization import rasterization
-
-    means, turns = scene.at(time)
     middle = (around.min(0) + around.max(0)) / 2
     poses, lens = _cameras(middle, np.linalg.norm(around - middle, axis=1).max())
     lenses = np.tile(lens, (len(poses), 1, 1))
-    arrays = (means, turns, scene.scale, scene.opacity, scene.sh, poses, lenses)
-    tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays)
-    with torch.no_grad():
-        options = {"near_plane": scene.near, "sh_degree": scene.sh_degree, "render_mode": "ED"}
-        depth, alpha, _ = rasterization(*tensors, SIDE, SIDE, **options)
-    return _unproject(depth[..., 0].double().numpy(), alpha[..., 0].numpy() >= 0.5, poses, lens)
+    depth, alpha = draw_scene(scene, time, poses, lenses, (SIDE, SIDE), "ED")
+    return _unproject(depth[..., 0].astype(np.float64), alpha[..., 0] >= 0.5, poses, lens)
 
 
 def _cameras(middle: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -77,7 +77,7 @@ def _interval_table(report: VideoReport) -> TextTable:
     means = report.mean() | {name: score.value for name, score in report.learned.items()}
     titles = {name: metric_title(name, unit) for name, unit in PICTURE_UNITS.items()} | LEARNED_TITLES
     rows = [[titles[name], four_digits(means[name]), four_digit_ends(own)] for name, own in report.intervals.items()]
-    return TextTable("All views", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
+    return TextTable("All views", ["metric", "mean", report.resampling.title], rows)
 
 
 def _counts(score: LearnedScore) -> str:
@@ -126,7 +126,7 @@ def _surface_table(report: VideoReport) -> TextTable:
         [titles.get(name, title_of(name)), four_digits(mean_defined(each)), four_digit_ends(ends[name]) if ends else ""]
         for name, each in score.values().items()
     ]
-    return TextTable("Surface", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
+    return TextTable("Surface", ["metric", "mean", report.resampling.title], rows)
 
 
 def _percent(error: float, diameter: float) -> str:

@@ -31,6 +31,7 @@ from dpcli.segment.prediction_settings import PredictSettings, Refinement
 from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segmenter
 from dpcli.segment.sequence_splits import sequences_of_split
+from dpcli.segment.thinning import spread_places
 from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
 from dpcli.store.schema import taken_for_meters
@@ -120,13 +121,7 @@ def predict_file(
         flow = str(estimator.resolve() if estimator else flow)
         work = PartsOfSequence(once, flow, str(choose_device(device)), refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
-        still = [reader.names[i] for i in sequences if reader.frame_counts[i] < 2]
-        if still and settings.classical.method == "multibody":
-            log.warn(f"{data}: one frame shows no motion: all is one part in {first_names(still)}")
-        if settings.classical.method == "multibody" and not (segmenter.by_tracks and "track" in reader.fields):
-            _tell_of_thinning(reader, sequences, refinement.points)
-        if refinement.pairs == "all":
-            _tell_of_many_pairs(reader, sequences, segmenter.slots)
+        _tell_of_input(data, reader, sequences, segmenter, refinement)
         if force or not already_made(target, entry, PartsReader, WORK):
             if settings.classical.method == "scene":
                 for line in taken_for_meters(reader.path, reader.length_unit):
@@ -145,6 +140,20 @@ def predict_file(
             ) as writer:
                 _predict_sequences(reader, sequences, work, writer, fields, spread, settings.classical)
         return _close(target, drawings, settings.classical.method == "scene")
+
+
+def _tell_of_input(
+    data: str, reader: CloudsReader, sequences: list[int], segmenter: Segmenter, refinement: Refinement
+) -> None:
+    """Says what of the sequences shows no motion, is not looked at, or takes much memory."""
+    if isinstance(segmenter, MultibodySegmenter):
+        still = [reader.names[i] for i in sequences if reader.frame_counts[i] < 2]
+        if still:
+            log.warn(f"{data}: one frame shows no motion: all is one part in {first_names(still)}")
+        if not (segmenter.by_tracks and "track" in reader.fields):
+            _tell_of_thinning(reader, sequences, refinement.points)
+    if refinement.pairs == "all":
+        _tell_of_many_pairs(reader, sequences, segmenter.slots)
 
 
 def _tell_of_thinning(reader: CloudsReader, sequences: list[int], points: int) -> None:
@@ -302,7 +311,7 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
 
     with PartsReader(target) as reader:
         if drawings.picture is not None:
-            shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
+            shown = spread_places(len(reader), _ROWS)
             sequences, look = [reader.read(int(i)) for i in shown], usual_look(reader.provenance)
             if scene:
                 sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged, state_of, take_state
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.config import FlowConfig, FlowSchedule
@@ -21,10 +21,11 @@ from dpcli.segment.flow.losses import flow_loss
 from dpcli.segment.flow.model_file import save_flow_model
 from dpcli.segment.frame_pairs import PairSource
 from dpcli.segment.sequence_splits import hold_out_sequences
+from dpcli.segment.thinning import spread_places
 from dpcli.store import CloudsReader
 
 _JUDGED = 64  # held-out pairs
-_SAVED = ("step", "best", "sums", "spent")  # of a trainer, beside the network and the optimizer
+_SAVED = ("step", "best", "sums", "spent", "model", "optimizer")  # of a trainer
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
 
 
@@ -66,10 +67,7 @@ class FlowTrainer:
 
         Raises Stopped when a stop was asked for, after saving.
         """
-        state = self.folder.load_state()
-        if state is not None:
-            with self.folder.restoring():
-                self._restore(state)
+        self.folder.resume(self._restore)
         self.model.train()
         with Progress("flow", self.steps, "step") as bar:
             bar.skip(self.step)
@@ -144,8 +142,7 @@ class FlowTrainer:
             return None, None
         self.model.eval()
         losses, errors = [], []
-        spread = np.linspace(0, len(self.held.pairs) - 1, min(_JUDGED, len(self.held.pairs))).astype(int)
-        for number in spread:
+        for number in spread_places(len(self.held.pairs), _JUDGED):
             pair = self.held.load(self.held.pairs[number])
             first, second = torch.from_numpy(pair.points).to(self.device).unbind()
             flows = self.model(first[None], second[None])
@@ -157,19 +154,10 @@ class FlowTrainer:
         return float(np.mean(losses)), float(np.mean(errors)) if errors else None
 
     def _save(self) -> None:
-        self.folder.save_state(
-            {
-                **{key: getattr(self, key) for key in _SAVED},
-                "model": self.model.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-            }
-        )
+        self.folder.save_state(state_of(self, _SAVED))
 
     def _restore(self, state: dict) -> None:
-        for key in _SAVED:
-            setattr(self, key, state[key])
-        self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        take_state(self, _SAVED, state)
         self.folder.tell_continuing(f"step {self.step + 1} of {self.steps}" if self.step < self.steps else None)
 
 

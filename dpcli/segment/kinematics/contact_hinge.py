@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from dpcli.ops.rotations import axis_rotation
 from dpcli.segment.kinematics.joint_fit import JointFit
+from dpcli.segment.thinning import thin_evenly
 from dpcli.store.joints import REVOLUTE
 
 _TOUCHING = 1.5, 2.0, 3.0  # spacings between points that touch: the least by which enough do
@@ -30,7 +31,7 @@ def contact_hinge(child: list[np.ndarray], parent: list[np.ndarray], spacing: fl
     if len(place) < _FEWEST:
         return None
     point = np.median(place, axis=0)
-    thinned = [_thinned(own, _MOST) for own in child]
+    thinned = [thin_evenly(own, _MOST) for own in child]
     first = thinned[0]
     near = cKDTree(first).query(first, k=2)[0][:, 1] if len(first) > 1 else np.zeros(1)
     scale = max(float(np.median(near)), spacing)
@@ -50,8 +51,7 @@ def _lasting_contact(child: list[np.ndarray], parent: list[np.ndarray], spacing:
     if not all(map(len, (*child, *parent))):
         return np.zeros((0, 3))
     apart = np.concatenate([cKDTree(other).query(own)[0] for own, other in zip(child, parent)])
-    touching = np.flatnonzero(apart < _TOUCHING[-1] * spacing)
-    touching = _thinned(touching, _PLACES)
+    touching = thin_evenly(np.flatnonzero(apart < _TOUCHING[-1] * spacing), _PLACES)
     places, apart = np.concatenate(child)[touching], apart[touching]
     for own in child:
         apart = np.maximum(apart, cKDTree(own).query(places)[0])
@@ -60,10 +60,6 @@ def _lasting_contact(child: list[np.ndarray], parent: list[np.ndarray], spacing:
         if len(lasting) >= _ENOUGH:
             break
     return lasting
-
-
-def _thinned(points: np.ndarray, most: int) -> np.ndarray:
-    return points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(int)]
 
 
 def _best_angle(

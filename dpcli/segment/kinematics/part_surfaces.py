@@ -7,6 +7,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from dpcli.segment.thinning import thin_evenly
+
 _MOST = 20_000  # points that a surface is made of
 _REACH = 3.5  # of an alpha shape's balls, in distances between neighboring points: wide enough to close, thin enough for holes
 _THIN = 0.1  # of that distance: the thickness on each side that points in a plane get
@@ -18,8 +20,7 @@ def part_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The outer boundary of the alpha complex (Edelsbrunner & Mücke 1994); where that has no triangle, the convex hull; where
     the points lie in a line or are fewer than three, a small tetrahedron about their middle, so that every link has a shape.
     """
-    if len(points) > _MOST:
-        points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
+    points = thin_evenly(points, _MOST)
     middle = points.mean(0)  # far from the origin tetrahedra lose their shape
     points = np.unique(points - middle, axis=0)
     spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1])) if len(points) > 1 else 0.0

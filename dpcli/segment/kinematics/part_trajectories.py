@@ -10,6 +10,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.ops.rotations import nearest_rotation
 from dpcli.segment.rigid_motions import bring_to_rest, move
+from dpcli.segment.thinning import thin_evenly
 from dpcli.store import CloudSequence, PartsSample
 
 _ROUNDS = 20  # of averaging; it settles in a few
@@ -112,6 +113,4 @@ def points_at_start(sequence: CloudSequence, part: int, motion: np.ndarray, most
         own = points[ids == part].astype(np.float64)
         clouds.append(bring_to_rest(own, motion[t]))
     joined = np.concatenate(clouds)
-    if most is not None and len(joined) > most:
-        joined = joined[np.linspace(0, len(joined) - 1, most).astype(int)]
-    return joined
+    return joined if most is None else thin_evenly(joined, most)

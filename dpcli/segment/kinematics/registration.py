@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.ops.rotations import motion_matrix, rotation_matrix, rotation_vector
 from dpcli.segment.flow.surface_icp import Surface, columns
 from dpcli.segment.rigid_motions import bring_to_rest
+from dpcli.segment.thinning import spread_places
 
 _SAMPLES = 12  # halves of the points that are registered anew
 _FRAMES = 12  # of a part that are registered; others are known as surely as the nearest of these
@@ -48,7 +49,7 @@ def register(clouds: list[np.ndarray], motion: np.ndarray, rng: np.random.Genera
     joined = np.concatenate(back)
     center, size = joined.mean(0), max(float(np.sqrt(joined.var(0).sum())), 1e-9)
     unit = [_some((cloud - center) / (2 * size), _MOST, rng) for cloud in back]
-    chosen = np.unique(np.linspace(0, len(unit) - 1, min(len(unit), _FRAMES)).astype(int))
+    chosen = spread_places(len(unit), _FRAMES)
     spread = np.stack([_spread(unit[t], [unit[u] for u in chosen if u != t], rng) for t in chosen])
     lengths = np.repeat([1.0, 2 * size], 3)
     covariance = spread * lengths[:, None] * lengths

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.segment.flow.surface_icp import Surface
+from dpcli.segment.thinning import thin_evenly
 
 _COSINE = np.cos(np.radians(12))  # of the normals that make one direction
 _NORMALS = 3  # directions of normals of a part
@@ -23,7 +24,7 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
     """
     if len(points) < _FEWEST:
         return np.zeros((0, 3))
-    points = _thinned(points)
+    points = thin_evenly(points, _MOST)
     centered = points - points.mean(0)
     normals = Surface(centered / max(float(np.abs(centered).max()), 1e-9)).normals.astype(np.float64)
     found: list[np.ndarray] = []
@@ -38,7 +39,7 @@ def surface_directions(points: np.ndarray) -> np.ndarray:
 
 def directions_and_edges(points: np.ndarray) -> np.ndarray:
     """Returns the part's surface directions, and the edges of a plate across the most frequent, f64 (D,3)."""
-    points = _thinned(points)
+    points = thin_evenly(points, _MOST)
     found = surface_directions(points)
     return np.concatenate([found, _plate_edges(points - points.mean(0), found[0])]) if len(found) else found
 
@@ -54,10 +55,6 @@ def distinct_directions(directions: np.ndarray) -> np.ndarray:
         if not chosen or (np.abs(directions[chosen] @ direction) <= _ALIKE).all():
             chosen.append(k)
     return directions[chosen]
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    return points if len(points) <= _MOST else points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
 
 
 def _alike(some: np.ndarray, normals: np.ndarray) -> np.ndarray:

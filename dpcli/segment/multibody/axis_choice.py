@@ -13,6 +13,7 @@ from dpcli.segment.kinematics.part_trajectories import Trajectories
 from dpcli.segment.kinematics.surface_directions import directions_and_edges, distinct_directions
 from dpcli.segment.multibody.frames import Frames
 from dpcli.segment.multibody.point_fit import NUMBER_PRICE, PointFit
+from dpcli.segment.thinning import spread_places
 from dpcli.store import CloudSequence
 from dpcli.store.joints import PRISMATIC, REVOLUTE
 
@@ -39,8 +40,8 @@ class SeenParts:
     """Holds the points of a sequence's parts, in up to 12 of its frames, scaled to diameter 1, and the parts' motions."""
 
     def __init__(self, sequence: CloudSequence, trajectories: Trajectories) -> None:
-        rng, count = np.random.default_rng(0), sequence.num_frames
-        self._chosen = np.unique(np.linspace(0, count - 1, min(count, _FRAMES)).astype(int))
+        rng = np.random.default_rng(0)
+        self._chosen = spread_places(sequence.num_frames, _FRAMES)
         self._ids, self._motion = trajectories.ids, trajectories.motion[self._chosen, :, :3]
         frames = np.split(np.arange(len(sequence.points)), sequence.frame_offsets[1:-1])
         rows = [_thinned(frames[t], sequence.part, rng) for t in self._chosen]

@@ -10,6 +10,7 @@ from dpcli.ops.rotations import rotation_matrix, rotation_vector
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of
 from dpcli.segment.multibody.frames import Frames, Trajectory, relative_motion
 from dpcli.segment.rigid_motions import compose, move
+from dpcli.segment.thinning import thin_evenly
 
 _AS_GOOD = 0.02  # cost of a point by which two motions of a body may differ by chance of the points drawn
 _CLEARLY = 0.05  # radians by which another motion must turn less
@@ -48,8 +49,7 @@ def _least_turning(frames: Frames, body: Body, inside: np.ndarray, reference: Tr
 
 def _own_points(frames: Frames, trajectory: Trajectory, inside: np.ndarray) -> np.ndarray:
     """Returns points (n,3) of the body, of all frames, in its own coordinates, evenly thinned to `_MOST`."""
-    rows = np.flatnonzero(inside)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MOST)).astype(int)]
+    rows = thin_evenly(np.flatnonzero(inside), _MOST)
     motion = trajectory[np.searchsorted(frames.starts, rows, side="right") - 1]
     return np.einsum("nij,ni->nj", motion[:, :, :3], frames.points[rows] - motion[:, :, 3])
 

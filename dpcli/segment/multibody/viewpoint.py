@@ -9,6 +9,7 @@ from dpcli.segment.multibody.explanation import Explanation
 from dpcli.segment.multibody.frames import POINT_SHARE, Frames
 from dpcli.segment.multibody.visibility import DepthMap
 from dpcli.segment.rigid_motions import move
+from dpcli.segment.thinning import spread_places
 
 _DIRECTIONS = 100  # tried, some 20 degrees apart
 _DISTANCES = (2.0, 1.5, 3.0, 6.0)  # diameters from the middle of all points
@@ -47,7 +48,7 @@ class _Sight:
 
     def __init__(self, frames: Frames, found: Explanation) -> None:
         self.middle, self.spacing = frames.points.mean(0), frames.spacing
-        shown = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).astype(int))
+        shown = spread_places(len(frames), _FRAMES)
         self.clouds = [frames.points[frames.slice(u)] for u in shown]
         self.bad = [_badly_explained(frames, found, u) for u in shown]
         self.weight = max(sum(float(weight.sum()) for _, weight in self.bad), 1e-9)
@@ -95,7 +96,7 @@ def _badly_explained(frames: Frames, found: Explanation, u: int) -> tuple[np.nda
                 moved.append(move(motion, points[badly > 0]))
                 cost.append(badly[badly > 0])
     moved, cost = np.concatenate(moved), np.concatenate(cost)
-    some = np.linspace(0, max(len(moved) - 1, 0), min(len(moved), _POINTS)).astype(int)
+    some = spread_places(len(moved), _POINTS)
     return moved[some], cost[some]
 
 

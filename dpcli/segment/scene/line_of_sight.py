@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dpcli.segment.thinning import thin_evenly
+
 _NEIGHBORS = 6
 _SAMPLE = 4000  # points that tell where the sensor stood
 _ROWS = 1.2  # distances between rows that beams lie beside a place: the rows below and above it, of which one may see over an edge
@@ -74,8 +76,7 @@ def range_jumps(points: np.ndarray, origin: np.ndarray) -> float:
     It is small at the true place, where only outlines of objects count, and larger elsewhere, whence far and near mix.
     """
     sight = LineOfSight(points, origin, _SAME_ROW)
-    some = points[np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(int)]
-    reach, ends, _ = sight.beside(some)
+    reach, ends, _ = sight.beside(thin_evenly(points, _SAMPLE))
     known = np.isfinite(ends)
     jumps = np.abs(np.log(np.where(known, ends, 1) / np.maximum(reach, 1e-9)[:, None])) > 0.1
     return float((jumps & known).sum() / max(known.sum(), 1))

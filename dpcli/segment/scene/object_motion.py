@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from dpcli.segment.rigid_motions import move
 from dpcli.segment.scene.world import Frame, World
+from dpcli.segment.thinning import thin_evenly
 
 _CELL = 0.2  # meters, of the map of distances
 _CUT = 0.6  # meters: a point farther from everything has no partner
@@ -24,7 +25,7 @@ def search_velocity(points: np.ndarray, t: int, others: list[int], world: World,
 
     Displacements up to `reach` on a grid, the same from frame to frame; fine ones near zero.
     """
-    points = points[np.linspace(0, len(points) - 1, min(len(points), _FEW)).astype(int)]
+    points = thin_evenly(points, _FEW)
     coarse = np.arange(-reach, reach + 1e-9, _CELL)
     fine = np.arange(-0.5, 0.51, 0.05)
     steps = np.concatenate([np.stack(np.meshgrid(a, a), -1).reshape(-1, 2) for a in (coarse, fine)])
@@ -64,7 +65,7 @@ def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
 
     Objects stay level: they turn about the upright axis only, and only where they are large enough to show it.
     """
-    points = points[np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)]
+    points = thin_evenly(points, _MOST)
     motion, moved = start.copy(), move(start, points)
     middle, radius = (moved.min(0) + moved.max(0)) / 2, np.linalg.norm(np.ptp(moved, axis=0)) / 2 + _CUTS[0]
     target = frame.solid[frame.tree.query_ball_point(middle, radius)] if len(frame.solid) else frame.solid
@@ -72,7 +73,7 @@ def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
     turns = len(points) >= 40 and np.ptp(points[:, :2], axis=0).max() > 1.0
     if len(target) < 3 or len(points) < 3:
         return motion
-    target = target[np.linspace(0, len(target) - 1, min(len(target), 3 * _MOST)).astype(int)]
+    target = thin_evenly(target, 3 * _MOST)
     tree = cKDTree(target)
     for cut in _CUTS:
         for _ in range(_STEPS):

@@ -17,7 +17,7 @@ import torch
 
 from dpcli.errors import DpcError
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged, state_of, take_state
 from dpcli.runtime.seeds import SegmentStream, torch_seed
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.rigid_groups import rigid_groups
@@ -30,7 +30,7 @@ from dpcli.segment.training.pair_loss import Batch, pair_loss, turn_randomly
 from dpcli.segment.training.settings import TrainSettings
 
 _SAVE_EVERY = 100  # steps between checkpoints: their flows are what memory holds
-_SAVED = ("epoch", "step", "best", "sums", "spent")  # of a trainer, beside the network, the optimizer and the flows
+_SAVED = ("epoch", "step", "best", "sums", "spent", "model", "optimizer")  # of a trainer, beside the flows
 Estimate = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
@@ -67,10 +67,7 @@ class Trainer:
 
     def run(self) -> None:
         """Trains from wherever the folder's state says to the last epoch."""
-        state = self.folder.load_state()
-        if state is not None:
-            with self.folder.restoring():
-                self._restore(state)
+        state = self.folder.resume(self._restore)
         finished = self.epoch >= self.schedule.epochs  # by an earlier run
         if not finished or self.folder.file("flows.npy").exists():  # which nothing needs after the end, and is large
             self._open_flows(state)
@@ -275,21 +272,11 @@ class Trainer:
         return batches
 
     def _save(self) -> None:
-        self.folder.save_state(
-            {
-                **{key: getattr(self, key) for key in _SAVED},
-                "model": self.model.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "flows": self.flows.pending(),
-            }
-        )
+        self.folder.save_state({**state_of(self, _SAVED), "flows": self.flows.pending()})
         self.flows.flush()
 
     def _restore(self, state: dict) -> None:
-        for key in _SAVED:
-            setattr(self, key, state[key])
-        self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        take_state(self, _SAVED, state)
         where = f"epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}"
         self.folder.tell_continuing(where if self.epoch < self.schedule.epochs else None)
 

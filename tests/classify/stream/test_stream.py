@@ -378,7 +378,7 @@ def run(*words: object) -> int:
 def predict(data: str, model: str, output: str | None = None, **options: object) -> None:
     """The command as a function, for the errors that it raises."""
     unused = {"jobs": None, "shard": "", "dask": "", "segments": False, "shortest": None}
-    unused |= {"stream": False, "follow": None, "json_output": False, "page": None}
+    unused |= {"stream": False, "follow": None, "json_output": False, "page": None, "hop": None, "window": None}
     command.predict(data=data, model=model, output=output, **{**unused, **options})
 
 

@@ -14,14 +14,11 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudsReader
 from tests.support.prepare_helpers import DPC, ROOT, dpc, write_msr
 
 SYNTHETIC = ("prepare", "synthetic", "gestures", "--frames", "6", "--size", "64", "--videos-per-class")
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_a_folder_becomes_a_file(tmp_path):
@@ -82,7 +79,7 @@ def test_a_pipe_carries_the_same_bytes_as_a_file(tmp_path):
     with h5py.File(io.BytesIO(piped.stdout)) as file:
         assert file.attrs["dpc_kind"] == "clouds"
     dpc(*SYNTHETIC, "1", "-o", tmp_path / "a.h5", "--jobs", "1")
-    assert digest(tmp_path / "a.h5") == hashlib.sha256(piped.stdout).hexdigest()
+    assert file_digest(tmp_path / "a.h5") == hashlib.sha256(piped.stdout).hexdigest()
 
 
 def test_options_reach_the_readers(tmp_path):
@@ -150,7 +147,7 @@ def test_signals_stop_and_the_next_run_continues(tmp_path):
     assert result.returncode == 0 and "continuing: " in result.stderr, result.stderr
     whole = tmp_path / "whole.h5"
     dpc(*SYNTHETIC, str(VIDEOS), "-o", whole)
-    assert digest(out) == digest(whole)
+    assert file_digest(out) == file_digest(whole)
     assert {p.name for p in tmp_path.iterdir()} == {"out.h5", "whole.h5"}
 
 

@@ -43,7 +43,7 @@ def test_an_exact_answer_has_no_error_also_turned_round_and_renamed():
         (0, -0.3),
     )
     for part, field in ((PART, TRUTH), (renamed, turned)):
-        found = joint_metrics([joint_statistics(PART, TRUTH, part, field)])
+        found = joint_metrics(joint_statistics(PART, TRUTH, part, field))
         assert (found["type"], found["edge_f1"], found["axis_within_5"]) == (1, 1, 1)
         assert [found[key] for key in ("axis_angle", "axis_position", "state_angle", "state_length")] == pytest.approx(
             [0, 0, 0, 0], abs=1e-6
@@ -85,7 +85,7 @@ def test_wrong_types_and_unmatched_parts_count_as_missed():
     found = joint_statistics(PART, TRUTH, merged, no_joints(2, 3))
     assert (found.joints, found.edges, found.predicted) == (2, 0, 0)
     total = found + JointStatistics(joints=2, types=2)
-    assert joint_metrics([total])["type"] == 0.5 and np.isnan(joint_metrics([found])["axis_angle"])
+    assert joint_metrics(total)["type"] == 0.5 and np.isnan(joint_metrics(found)["axis_angle"])
 
 
 def test_joints_that_move_visibly_have_their_own_denominator():
@@ -93,9 +93,9 @@ def test_joints_that_move_visibly_have_their_own_denominator():
     found = joint_statistics(PART, TRUTH, PART, near, lambda child, parent: (child, parent) == (1, 0))
     assert (found.joints, found.types, found.near, found.axes) == (2, 1, 1, 2)
     assert (found.visible, found.visible_types, found.visible_near, found.visible_axes) == (1, 1, 1, 1)
-    both = joint_metrics([found])
+    both = joint_metrics(found)
     assert (both["type"], both["visible_type"], both["visible_axis_within_5"]) == (0.5, 1, 1)
-    assert np.isnan(joint_metrics([joint_statistics(PART, TRUTH, PART, near)])["visible_type"])
+    assert np.isnan(joint_metrics(joint_statistics(PART, TRUTH, PART, near))["visible_type"])
 
 
 def test_a_motion_below_the_distance_between_points_is_not_visible():

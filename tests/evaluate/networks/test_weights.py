@@ -31,13 +31,13 @@ from dpcli.evaluate.networks.weights import (
     check_weights,
     find_weights,
     known_weights,
-    sha256_of,
     weights_folder,
     weights_named,
     whole_weights,
 )
 from dpcli.evaluate.networks.weights_fetch import fetch_weights
 from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
+from dpcli.runtime.provenance import file_digest
 
 CONTENT = bytes(range(256)) * 40
 ENTRY = Weights(
@@ -131,7 +131,7 @@ def test_check(tmp_path):
     assert check_file(path, ENTRY).state == "absent"
     path.write_bytes(CONTENT)
     found = check_file(path, ENTRY)
-    assert found.state == "present" and found.digest == sha256_of(path) == ENTRY.sha256 and "whole" in found.finding
+    assert found.state == "present" and found.digest == file_digest(path) == ENTRY.sha256 and "whole" in found.finding
     prefix = check_file(path, replace(ENTRY, sha256=ENTRY.sha256[:8]))
     assert prefix.state == "present" and "first 8 digits" in prefix.finding
     unknown = check_file(path, replace(ENTRY, sha256=""))
@@ -235,7 +235,7 @@ def test_load_state_refuses(tmp_path):
 def test_a_damaged_file_is_not_opened(tmp_path, monkeypatch):
     state = small().state_dict()
     torch.save(state, tmp_path / "toy.bin")
-    entry = replace(ENTRY, size=(tmp_path / "toy.bin").stat().st_size, sha256=sha256_of(tmp_path / "toy.bin"))
+    entry = replace(ENTRY, size=(tmp_path / "toy.bin").stat().st_size, sha256=file_digest(tmp_path / "toy.bin"))
     monkeypatch.setattr(module, "known_weights", lambda: {"toy": entry})
     assert same(load_tensors(whole_weights("toy", tmp_path, digest=True)), state)
     monkeypatch.setattr(module, "known_weights", lambda: {"toy": replace(entry, size=entry.size + 1)})

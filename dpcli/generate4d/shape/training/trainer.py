@@ -24,7 +24,7 @@ from dpcli.generate4d.shape.training.rounds import Batch, Kept, MakeModels, Wind
 from dpcli.generate4d.shape.training.settings import ShapeSchedule
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged
+from dpcli.runtime.run_folder import LossWatch, RunFolder, diverged, state_of, take_state
 from dpcli.runtime.seeds import Generate4DStream, generator
 from dpcli.runtime.signals import StopRequest
 
@@ -32,6 +32,7 @@ _WARM = 200  # steps until the learning rate is at its largest
 _GUESSED = 0.25  # of the pictures are decoded at the network's own angles
 _RUNAWAY = 1000  # times the first loss
 _MEMORY = 0.999  # of the running mean of the weights
+_SAVED = ("step", "best", "sums", "spent", "model", "mean", "optimizer")  # of a trainer
 
 
 class ShapeTrainer:
@@ -70,10 +71,7 @@ class ShapeTrainer:
 
         Raises Stopped when a stop was asked for, after saving.
         """
-        state = self.folder.load_state()
-        if state is not None:
-            with self.folder.restoring():
-                self._restore(state)
+        state = self.folder.resume(self._restore)
         sizes = self.schedule
         rounds = math.ceil(sizes.steps / self.per_round)
         if self.step < sizes.steps:
@@ -159,15 +157,10 @@ class ShapeTrainer:
         self.folder.draw_curves()
 
     def _save(self) -> None:
-        networks = {"model": self.model.state_dict(), "mean": self.mean.state_dict()}
-        plain = {key: getattr(self, key) for key in ("step", "best", "sums", "spent")}
-        self.folder.save_state({**plain, **networks, "optimizer": self.optimizer.state_dict()})
+        self.folder.save_state(state_of(self, _SAVED))
 
     def _restore(self, state: dict) -> None:
-        for key in ("step", "best", "sums", "spent"):
-            setattr(self, key, state[key])
-        for key in ("model", "mean", "optimizer"):
-            getattr(self, key).load_state_dict(state[key])
+        take_state(self, _SAVED, state)
         end = self.schedule.steps
         self.folder.tell_continuing(f"step {self.step + 1} of {end}" if self.step < end else None)
 
