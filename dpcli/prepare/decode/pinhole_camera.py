@@ -20,6 +20,10 @@ _KINECT_MODES = {  # width and height of an Azure Kinect's depth: pixels of its 
     (512, 512): (2, 0, 0),
     (1024, 1024): (1, 0, 0),
 }
+_TURNED, _UPRIGHT = (
+    0.2,
+    0.1,
+)  # how far off the middle a principal point lies in pictures that were turned, and in those before
 _ARRIVES = 1e-3  # focal lengths by which a ray may miss its pixel
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
@@ -152,6 +156,10 @@ def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndar
     return z
 
 
+def _off_middle(across: float, down: float) -> float:
+    return abs(across - 0.5) + abs(down - 0.5)
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter.
@@ -189,6 +197,12 @@ class Calibration:
                 f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
             )
         across, down = (camera.cx + 0.5) / width, (camera.cy + 0.5) / height
+        turned = ((camera.cy + 0.5) / width, (camera.cx + 0.5) / height)
+        if _off_middle(across, down) > _TURNED and _off_middle(*turned) < _UPRIGHT:
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be that of pictures that were turned by a"
+                f" quarter into these {found} ones; expected the camera of the turned pictures: exchange fx and fy, cx and cy"
+            )
         outside = not (0 <= across <= 1 + 0.5 / width and 0 <= down <= 1 + 0.5 / height)
         scaled = not self.width and abs(across - down) < _ALIKE and not _MIDDLE[0] < across < _MIDDLE[1]
         if outside or scaled:
