@@ -18,6 +18,7 @@ from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
     doubts_of_place,
+    doubts_of_shape,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -201,12 +202,15 @@ class DepthVideos:
                 " camera: save it as a file of its own"
             )
         video = self._video(item)
-        camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
+        height, width = video.frames.shape[1:]
+        odd = doubts_of_shape(item.path, name, width, height)
+        camera = self._camera(width, height, video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
         notes |= (
             doubts_of_name(name)
+            | odd
             | video.notes
             | ({} if told else doubts_of_units(depth) or doubts_of_place(item.path, depth))
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,12 @@ LIKE_TUM = "videos beside {}, a list as TUM's data sets have it; if they are of 
 UP_TO_ONE = (
     "videos of depths that end at exactly 1, as a depth buffer's or those divided by the largest do; taken for meters"
     " (--depth-scale, --far)"
+)
+_PANORAMA = re.compile(r"panoram|(?<![a-z])pano(?![a-z])|equirect|(?<![a-z])erp(?![a-z])", re.IGNORECASE)
+_BAND = 6  # times as wide as high: what turning lidars see, and no depth camera
+LIKE_RANGES = (
+    "videos of pictures many times as wide as high, as turning lidars' range images are, whose columns are angles and whose numbers"
+    " lengths of rays; taken for a camera's (their points are read by `dpc prepare clouds`)"
 )
 _ROWS = 16  # of a frame that are looked at
 
@@ -69,6 +76,18 @@ def _marks(frames: np.ndarray) -> np.ndarray | None:
         least = _MARKS_16 if kind.kind == "u" else np.iinfo(kind).max
         return frames >= least if largest >= least else None
     return (frames == 65535) | (frames >= np.iinfo(np.int32).max) if largest >= 65535 else None
+
+
+def doubts_of_shape(path: Path, name: str, width: int, height: int) -> dict[str, int]:
+    """Returns a note where pictures are so wide that no camera took them. Raises DataError where they are panoramas, by their
+    name and shape.
+    """
+    if width == 2 * height and _PANORAMA.search(name):
+        raise DataError(
+            f"{path}: by its name and its shape ({width}x{height}) it holds panoramas, whose columns are angles; expected depth of"
+            " a pinhole camera: cut views out of them (such as with py360convert's e2p), or call it otherwise if it isn't so"
+        )
+    return {LIKE_RANGES: 1} if width >= _BAND * height > _BAND else {}
 
 
 def require_byte_order(name: str, frames: np.ndarray) -> None:

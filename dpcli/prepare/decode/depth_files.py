@@ -41,7 +41,9 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
-_ALONG_RAY = re.compile(r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid", re.IGNORECASE)
+_ALONG_RAY = re.compile(
+    r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid|long[ _]?throw|ahat", re.IGNORECASE
+)
 _RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
 _BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
