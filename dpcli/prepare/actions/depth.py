@@ -37,7 +37,7 @@ from dpcli.prepare.decode.depth_files import (
     require_depth,
     tells_times,
 )
-from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
+from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, poses_below, stores, walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, without_rays
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
@@ -325,6 +325,10 @@ class DepthVideos:
             )
             if cameras := [one for given in self.inputs for one in calibrations_below(given)]:
                 lines.append(f"{first_names(cameras, 3)}: not read; if the camera is in there, give --intrinsics FILE")
+        if poses := [one for given in self.inputs for one in poses_below(given)]:
+            lines.append(
+                f"{first_names(poses, 3)}: not read; if the camera moved, points stay in its axes of each moment"
+            )
         if self.calibration:
             lines += self.calibration.notes()
         if _FARTHEST < self.far < np.inf:

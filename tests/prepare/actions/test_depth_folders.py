@@ -329,6 +329,19 @@ def test_a_camera_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
     assert [any(line.startswith(said) for line in lines) for lines in told] == [True, False]
 
 
+@pytest.mark.parametrize(
+    "name", ["../groundtruth.txt", "frame-000000.pose.txt", "../pose/0.txt", "odometry.csv", "noposes.txt"]
+)
+def test_poses_beside_the_frames_that_are_not_read_are_named(tmp_path, name):
+    folder = write(tmp_path / "scene" / "depth", **{"000": depth(1000), "001": depth(1001)})
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("0 0 0 0 0 0 0 1")
+    reader = DepthVideos(inputs=(tmp_path / "scene",), fov=60)
+    where = "scene/" if name[:2] == ".." else "scene/depth/"
+    told = f"{where}{name.removeprefix('../')}: not read; if the camera moved, points stay in its axes of each moment"
+    assert (told in reader.summary(reader.items())) is (name != "noposes.txt")
+
+
 def test_a_topic_without_a_recording_is_refused(tmp_path):
     write(tmp_path / "a", **{"000": depth(1000), "001": depth(1001)})
     with pytest.raises(UsageError, match="--topic /depth: no recording"):
