@@ -243,7 +243,7 @@ class DepthVideos:
     def _video(self, item: Item) -> DepthVideo:
         """Returns the frames of an item, with the camera that a recording describes."""
         if not item.extra["recording"]:
-            return read_depth_video(item.path, self.stride, item.extra["series"])
+            return read_depth_video(item.path, self.stride, item.extra["series"], with_camera=not self._given_camera)
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
         read, camera, scale = read_recorded_depth(

@@ -401,10 +401,8 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
     return depth_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else archived_depth(path).depth, stride)
 
 
-def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any]:
-    """Returns what the arrays beside those of so many frames of depth tell, and the attributes of these, by the fields of a
-    `DepthVideo`.
-    """
+def _told_beside(path: Path, found: ArchivedDepth, frames: int, with_camera: bool) -> dict[str, Any]:
+    """Returns what the arrays beside those of so many frames of depth tell, and their attributes, by the fields of a `DepthVideo`."""
     from dpcli.prepare.decode.calibration import camera_of_any
     from dpcli.prepare.times_beside import seconds_beside
 
@@ -414,7 +412,7 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
     times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
     name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
     further = ({**attributes, **own}, attributes, own, {})  # a unit may be that of numbers once they are scaled
-    (camera, scale, rest), used = camera_of_any(path, further, found.small)
+    (camera, scale, rest), used = camera_of_any(path, further, found.small, frames, with_camera=with_camera)
     rest += tuple(f"attribute {one}" for one in attributes if one not in used)
     scale = scale if whole else 1 / METERS[unit] if unit not in ("", "m") else None  # fractions are lengths
     unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
@@ -430,15 +428,16 @@ def tells_times(path: Path) -> bool:
         with open_arrays(path) as arrays:
             if not any(says_times(name.rpartition("/")[2]) for name in arrays):
                 return False
-        return _read_file(path, 1).time is not None
+        return _read_file(path, 1, with_camera=False).time is not None
     except DataError:  # reading says so
         return False
 
 
-def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
-    """Reads any depth video: a video file, a file of arrays, or a folder of frames, of which ``series`` says which.
-
-    ``stride`` keeps every n-th frame. Raises DataError when it can't be read, or holds no frame.
+def read_depth_video(
+    path: Path, stride: int = 1, series: Series | None = None, *, with_camera: bool = True
+) -> DepthVideo:
+    """Reads any depth video: a video file, a file of arrays, or a folder of frames, of which ``series`` says which; of every
+    ``stride``-th frame. with_camera: whether a camera that it tells is wanted. Raises DataError when nothing can be read.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -451,14 +450,15 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         turned = tiff.read_tags(data).get(tiff.ORIENTATION, (1,))[0] != 1  # which OpenCV does
         known = {WHITE_AT_ZERO: int(has_white_at_zero(data)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
-        told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
+        if first.suffix.lower() in ARRAY_SUFFIXES[1:]:
+            told = _told_beside(first, archived_depth(first), 1, with_camera)
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
         bits = significant_bits(first) if first.suffix.lower() == ".png" and video.frames.dtype == np.uint16 else 16
         if bits < 16 and video.frames.max(initial=0) >= 1 << bits:
             video.notes[SPREAD.format(bits)] = 1
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         with stand_ins_named(path):
-            video = _read_file(path, stride)
+            video = _read_file(path, stride, with_camera)
     else:
         kinds = ", ".join((*ARRAY_SUFFIXES, *VIDEO_SUFFIXES))
         raise DataError(f"{path}: unknown kind; expected a folder of images, or one of {kinds}")
@@ -467,12 +467,12 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
     return video
 
 
-def _read_file(path: Path, stride: int) -> DepthVideo:
+def _read_file(path: Path, stride: int, with_camera: bool) -> DepthVideo:
     """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
     if path.suffix.lower() in ARRAY_SUFFIXES[1:]:
         found = archived_depth(path)
         frames = depth_frames(path, found.depth)
-        told = _told_beside(path, found, len(frames))
+        told = _told_beside(path, found, len(frames), with_camera)
         if told["time"] is not None:
             told["time"] = told["time"][::stride]
         return DepthVideo(np.ascontiguousarray(frames[::stride]), **told)
@@ -490,7 +490,7 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
     }
     notes = {what: count for what, count in told.items() if count}
     camera = None
-    if path.suffix.lower() == ".mkv" and (text := attached_json(path)):
+    if with_camera and path.suffix.lower() == ".mkv" and (text := attached_json(path)):
         from dpcli.prepare.decode.calibration import attached_calibration
 
         try:
