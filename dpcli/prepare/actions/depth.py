@@ -17,6 +17,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
+    doubts_of_name,
     doubts_of_place,
     doubts_of_shape,
     doubts_of_units,
@@ -31,7 +32,6 @@ from dpcli.prepare.decode.depth_files import (
     ARRAY_SUFFIXES,
     VIDEO_SUFFIXES,
     DepthVideo,
-    doubts_of_name,
     frame_series,
     read_depth_video,
     require_depth,
@@ -212,7 +212,7 @@ class DepthVideos:
             doubts_of_name(name)
             | odd
             | video.notes
-            | ({} if told else doubts_of_units(depth) or doubts_of_place(item.path, depth))
+            | ({} if told or odd else doubts_of_units(depth) or doubts_of_place(item.path, depth))
         )
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:

@@ -41,10 +41,6 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
-_ALONG_RAY = re.compile(
-    r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid|long[ _]?throw|ahat", re.IGNORECASE
-)
-_RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
 _BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY_NOISE, _COLORED_SHARE = 24, 0.02
@@ -62,6 +58,7 @@ SPREAD = (
 _MARGINS = "says that margins of its frames are cut off; write it again without them: ffmpeg -i IN -c:v ffv1 depth.mkv"
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
+ZOOMS = "videos whose frames have files with different cameras, of which the first counts (--fx ... gives another)"
 JOINED = "videos behind the first in one file, whose frames may not be read; join them by ffmpeg -f concat instead"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
@@ -358,21 +355,6 @@ def require_depth(path: Path, name: str) -> None:
         )
 
 
-def doubts_of_name(name: str) -> dict[str, int]:
-    """Returns a note where a video's name says distances from the camera's center, or what a network makes of one picture."""
-    if said := _ALONG_RAY.search(name):
-        return {
-            f"videos that by their names hold distances from the camera ({said[0]}), taken for depth along its axis; if they are"
-            " lengths of the rays, as Hypersim's are, flat walls come out bent: divide each by that of its pixel's ray": 1
-        }
-    if said := _RELATIVE.search(name):
-        return {
-            f"videos that by their names are what a network guessed from one picture ({said[0]}): as a rule neither meters nor, as"
-            " MiDaS's, depth but its inverse; taken for depth": 1
-        }
-    return {}
-
-
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame, (H,W) or (H,W,1), by its header where it has one."""
     try:
@@ -451,7 +433,8 @@ def read_depth_video(
         known = {WHITE_AT_ZERO: int(has_white_at_zero(data)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
         if first.suffix.lower() in ARRAY_SUFFIXES[1:]:
-            told = _told_beside(first, archived_depth(first), 1, with_camera)
+            told, last = (_told_beside(one, archived_depth(one), 1, with_camera) for one in (first, series.paths[-1]))
+            told["notes"] |= {ZOOMS: 1} if told["camera"] and not told["camera"].is_like(last["camera"]) else {}
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
         bits = significant_bits(first) if first.suffix.lower() == ".png" and video.frames.dtype == np.uint16 else 16
         if bits < 16 and video.frames.max(initial=0) >= 1 << bits:

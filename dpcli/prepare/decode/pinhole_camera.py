@@ -24,6 +24,7 @@ _TURNED, _UPRIGHT = (
     0.2,
     0.1,
 )  # how far off the middle a principal point lies in pictures that were turned, and in those before
+_LIKE = 0.01  # share by which cameras of frames differ that one stands for
 _ARRIVES = 1e-3  # focal lengths by which a ray may miss its pixel
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
@@ -173,6 +174,13 @@ class Calibration:
     depth_scale: float | None = None
     source: str = "the options"
     chosen: str = ""
+
+    def is_like(self, other: Calibration | None) -> bool:
+        """Returns whether another camera is this one, but for what calibrating anew changes."""
+        if other is None:
+            return False
+        pairs = ((getattr(one.intrinsics, name) for name in ("fx", "fy", "cx", "cy")) for one in (self, other))
+        return np.allclose(*map(list, pairs), rtol=_LIKE)
 
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.

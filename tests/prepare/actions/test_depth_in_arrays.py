@@ -9,6 +9,7 @@ from scipy.io import savemat
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.decode.depth_files import ZOOMS
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
 FRAMES = 8
@@ -148,6 +149,15 @@ def test_a_camera_told_for_every_frame_is_used_where_all_are_equal(tmp_path, for
         name: values + np.arange(FRAMES).reshape(-1, *[1] * (values.ndim - 1)) for name, values in camera.items()
     }
     assert "which differs from frame to frame" in read(write(tmp_path / f"c{form}", {"depth": DEPTH, **changing}))[1]
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.0, False), (0.01, False), (5.0, True)])
+def test_cameras_that_files_of_single_frames_tell_are_compared(tmp_path, step, told):
+    for frame in range(3):
+        np.savez(tmp_path / f"{frame}.npz", depth=DEPTH[frame], K=MATRIX + np.diag([step * frame, step * frame, 0]))
+    sequence, notes = read(tmp_path)
+    assert (ZOOMS in notes) is told
+    assert sequence.points[0, 0] == pytest.approx(-23.5 / 40 * DEPTH[0, 0, 0] / 1000)
 
 
 @pytest.mark.parametrize("form", ["v.npz", "v.h5", "v.mat"])
