@@ -38,7 +38,7 @@ from dpcli.prepare.decode.depth_files import (
     tells_times,
 )
 from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, poses_below, stores, walk_folders
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, without_rays
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, count_blind
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
@@ -217,9 +217,8 @@ class DepthVideos:
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
-        depth, blind = without_rays(self._inverted(depth, item.path), camera)
-        notes |= {BLIND: blind} if blind else {}
-        unit = 1 / scale
+        depth, unit = self._inverted(depth, item.path), 1 / scale
+        notes |= {BLIND: blind} if (blind := count_blind(depth, camera)) else {}
         seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0

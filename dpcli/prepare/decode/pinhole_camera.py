@@ -94,12 +94,11 @@ def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -
     return found.reshape(len(y), len(x), 2)
 
 
-def without_rays(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, int]:
-    """Returns depth (T,H,W) with 0 where the lens sends no ray, and how many pixels had a depth there."""
+def count_blind(depth: np.ndarray, intrinsics: Intrinsics) -> int:
+    """Returns how many pixels have a depth in frames (T,H,W) where the lens sends no ray, which `back_project` leaves out."""
     height, width = depth.shape[1:]
-    reached = ~np.isnan(pixel_rays(height, width, intrinsics)[:, 0]).reshape(height, width)
-    count = 0 if reached.all() else int(np.count_nonzero(depth[:, ~reached] > 0))
-    return (np.where(reached, depth, depth.dtype.type(0)) if count else depth), count
+    blind = np.isnan(pixel_rays(height, width, intrinsics)[:, 0]).reshape(height, width)
+    return int(np.count_nonzero(depth[:, blind] > 0)) if blind.any() else 0
 
 
 @lru_cache(maxsize=8)
@@ -113,7 +112,7 @@ def back_project(
     depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turns depth frames into points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in
-    near..far.
+    near..far that a ray reaches.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
     order within each frame, frames one after the other; counts i64 (T) of points per frame.
@@ -126,7 +125,9 @@ def back_project(
     frames, height, width = depth.shape
     rays = _complex_rays(height, width, intrinsics)
     # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
-    seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
+    reached = ~np.isnan(rays.real)
+    reached = None if reached.all() else reached
+    seen = [_seen(frame, np.float32(unit), near, far, reached) for frame in depth.reshape(frames, height * width)]
     counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
@@ -140,9 +141,13 @@ def back_project(
     return points, counts
 
 
-def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
-    pixels = np.flatnonzero(frame > 0)
+def _seen(
+    frame: np.ndarray, unit: np.float32, near: float, far: float, reached: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P). reached: which
+    pixels a ray reaches, None for all.
+    """
+    pixels = np.flatnonzero(frame > 0) if reached is None else np.flatnonzero((frame > 0) & reached)
     if near > 0 or far < np.inf:
         z = _lengths(frame, pixels, unit)
         pixels = pixels[(z >= near) & (z <= far)]
