@@ -40,7 +40,12 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}")
+            up = (
+                " (without its sign, fy is that of pictures that stand upright, as ICL-NUIM's do)"
+                if self.fy < 0
+                else ""
+            )
+            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}{up}")
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
