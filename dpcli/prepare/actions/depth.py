@@ -37,7 +37,14 @@ from dpcli.prepare.decode.depth_files import (
     require_depth,
     tells_times,
 )
-from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, poses_below, stores, walk_folders
+from dpcli.prepare.decode.folder_listing import (
+    calibrations_below,
+    count_suffixes,
+    poses_below,
+    scales_below,
+    stores,
+    walk_folders,
+)
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, count_blind
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key, sample_of_frames
@@ -328,6 +335,9 @@ class DepthVideos:
             lines.append(
                 f"{first_names(poses, 3)}: not read; if the camera moved, points stay in its axes of each moment"
             )
+        scales = [] if self._declared_scale else [one for given in self.inputs for one in scales_below(given)]
+        if scales:
+            lines.append(f"{first_names(scales, 3)}: not read; if it tells the unit of depth, give --depth-scale")
         if self.calibration:
             lines += self.calibration.notes()
         if _FARTHEST < self.far < np.inf:

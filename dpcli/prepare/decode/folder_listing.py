@@ -18,6 +18,7 @@ _CAMERA = re.compile(
     r"intrinsic|calib|(^|[^a-z])cam(era)?s?[-_ ]?(matri|info|param|intr)|(^|[-_.])(k|cameras?)$", re.IGNORECASE
 )
 _POSE = re.compile(r"(^|[^a-z])(poses?|traj(ectory)?|odom(etry)?|ground[-_ ]?truth)([^a-z]|$)", re.IGNORECASE)
+_SCALE = re.compile(r"depth[-_ ]?(map)?[-_ ]?(scal(e|ing)|units?|factor)|^(scale|units?)$", re.IGNORECASE)
 _POSES = re.compile(r"^poses?$", re.IGNORECASE)
 _CAMERAS = re.compile(r"intrinsics?$|^cameras?$|^calib", re.IGNORECASE)  # folders of them
 
@@ -80,6 +81,11 @@ def calibrations_below(root: Path) -> list[str]:
 def poses_below(root: Path) -> list[str]:
     """Returns the files that by their names tell how a camera moved, as `calibrations_below` does."""
     return _named_alike(root, (*_OF_CAMERAS, ".log", ".npz"), _POSE, _POSES)
+
+
+def scales_below(root: Path) -> list[str]:
+    """Returns the files that by their names tell the unit of depth, as `calibrations_below` does."""
+    return _named_alike(root, (".txt", ".json", ".csv", ".yaml", ".yml", ".npy"), _SCALE, re.compile("$^"))
 
 
 def _named_alike(root: Path, suffixes: tuple[str, ...], names: re.Pattern[str], folders: re.Pattern[str]) -> list[str]:

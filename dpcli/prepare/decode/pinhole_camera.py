@@ -195,8 +195,8 @@ class Calibration:
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
 
-        Raises DataError when they are of another shape, when the principal point lies outside of the pictures, or when a focal
-        length can't be one in pixels.
+        Raises DataError when they are of another shape, when the principal point lies outside of the pictures or is that of turned ones,
+        or when a focal length can't be one in pixels.
         """
         own, found = f"{self.width}x{self.height}", f"{width}x{height}"
         camera = self.intrinsics
@@ -216,7 +216,7 @@ class Calibration:
             )
         across, down = (camera.cx + 0.5) / width, (camera.cy + 0.5) / height
         turned = ((camera.cy + 0.5) / width, (camera.cx + 0.5) / height)
-        if _off_middle(across, down) > _TURNED and _off_middle(*turned) < _UPRIGHT:
+        if not self.width and _off_middle(across, down) > _TURNED and _off_middle(*turned) < _UPRIGHT:
             raise DataError(
                 f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be that of pictures that were turned by a"
                 f" quarter into these {found} ones; expected the camera of the turned pictures: exchange fx and fy, cx and cy"

@@ -342,6 +342,18 @@ def test_poses_beside_the_frames_that_are_not_read_are_named(tmp_path, name):
     assert (told in reader.summary(reader.items())) is (name != "noposes.txt")
 
 
+@pytest.mark.parametrize("name", ["../depth_scale.txt", "depth_units.json", "../scale.txt", "timescale.txt"])
+def test_the_unit_of_depth_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
+    """An L515 counts quarters of millimeters, which nothing else tells."""
+    folder = write(tmp_path / "scene" / "depth", **{"000": depth(1000), "001": depth(1001)})
+    (folder / name).write_text("0.00025")
+    told = f"scene/{'' if name[:2] == '..' else 'depth/'}{name.removeprefix('../')}: not read; if it tells the unit of depth,"
+    for scale in (None, 4000.0):
+        reader = DepthVideos(inputs=(tmp_path / "scene",), depth_scale=scale)
+        lines = reader.summary(reader.items())
+        assert any(line.startswith(told) for line in lines) is (scale is None and name != "timescale.txt")
+
+
 def test_a_topic_without_a_recording_is_refused(tmp_path):
     write(tmp_path / "a", **{"000": depth(1000), "001": depth(1001)})
     with pytest.raises(UsageError, match="--topic /depth: no recording"):
