@@ -339,7 +339,7 @@ class DepthVideos:
         if scales:
             lines.append(f"{first_names(scales, 3)}: not read; if it tells the unit of depth, give --depth-scale")
         if self.calibration:
-            lines += self.calibration.notes()
+            lines += [*self.calibration.notes(), *self._other_cameras(len(items))]
         if _FARTHEST < self.far < np.inf:
             lines.append(f"--far {self.far:g} cuts nothing, no depth camera sees so far; it is in meters")
         if not self._timed:
@@ -349,6 +349,19 @@ class DepthVideos:
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
         return lines + self._table.unnamed(items)
+
+    def _other_cameras(self, count: int) -> list[str]:
+        """Returns a line for the log where files called as the calibration that is taken for all videos lie beside some."""
+        own = Path(self.calibration.source) if self.calibration else Path()
+        below = [given.absolute().parent / one for given in self.inputs for one in calibrations_below(given)]
+        others = [one for one in below if one.name == own.name and one != own.absolute()]
+        if count < 2 or not others or not own.is_file():
+            return []
+        names = first_names([as_utf8(f"{one.parent.name}/{one.name}") for one in others], 3)
+        return [
+            f"{own}: is taken for all {count} videos, {names} for none; if these are other cameras, convert the videos of each"
+            " by itself, and join them with `dpc prepare merge`"
+        ]
 
 
 def _tells_time(item: Item) -> bool:

@@ -19,6 +19,7 @@ _CAMERA = re.compile(
 )
 _POSE = re.compile(r"(^|[^a-z])(poses?|traj(ectory)?|odom(etry)?|ground[-_ ]?truth)([^a-z]|$)", re.IGNORECASE)
 _SCALE = re.compile(r"depth[-_ ]?(map)?[-_ ]?(scal(e|ing)|units?|factor)|^(scale|units?)$", re.IGNORECASE)
+_OF_OTHERS = re.compile("extrin|colou?r|rgb", re.IGNORECASE)  # that no depth is made points of
 _POSES = re.compile(r"^poses?$", re.IGNORECASE)
 _CAMERAS = re.compile(r"intrinsics?$|^cameras?$|^calib", re.IGNORECASE)  # folders of them
 
@@ -100,7 +101,11 @@ def _named_alike(root: Path, suffixes: tuple[str, ...], names: re.Pattern[str], 
             stem, suffix = os.path.splitext(name)
             if suffix.lower() in suffixes and not is_hidden(name) and (known or names.search(stem)):
                 found.setdefault(folder, []).append(name)
-    return [os.path.relpath(os.path.join(folder, min(own)), root.absolute().parent) for folder, own in found.items()]
+    chosen = {
+        folder: min(own, key=lambda name: (_OF_OTHERS.search(name) is not None, "depth" not in name.lower(), name))
+        for folder, own in found.items()
+    }
+    return [os.path.relpath(os.path.join(*one), root.absolute().parent) for one in sorted(chosen.items())]
 
 
 def _leads_above(path: str) -> bool:

@@ -342,6 +342,24 @@ def test_poses_beside_the_frames_that_are_not_read_are_named(tmp_path, name):
     assert (told in reader.summary(reader.items())) is (name != "noposes.txt")
 
 
+def test_the_camera_of_one_video_is_not_that_of_all(tmp_path):
+    """Two Kinects, each with its own calibration beside its pictures, and ScanNet's files of intrinsics."""
+    for number in (1, 2):
+        write(tmp_path / f"cam{number}" / "depth", **{str(t): depth(1000 + t) for t in (0, 1)})
+        text = json.dumps({"fx": 10.0 * number, "fy": 10.0 * number, "cx": 3.5, "cy": 2.5})
+        (tmp_path / f"cam{number}" / "intrinsics.json").write_text(text)
+    first = read_calibration(tmp_path / "cam1" / "intrinsics.json")
+    reader = DepthVideos(inputs=(tmp_path,), calibration=first)
+    assert any("for all 2 videos, cam2/intrinsics.json for none" in line for line in reader.summary(reader.items()))
+    alone = DepthVideos(inputs=(tmp_path / "cam1",), calibration=first)
+    assert not any("for none" in line for line in alone.summary(alone.items()))
+    (tmp_path / "cam1" / "intrinsics.json").unlink()
+    for name in ("extrinsic_color", "extrinsic_depth", "intrinsic_color", "intrinsic_depth"):
+        (tmp_path / "cam1" / f"{name}.txt").write_text("1 0 0\n0 1 0\n0 0 1\n")
+    guess = DepthVideos(inputs=(tmp_path / "cam1",))
+    assert any(line.startswith("cam1/intrinsic_depth.txt: not read") for line in guess.summary(guess.items()))
+
+
 @pytest.mark.parametrize("name", ["../depth_scale.txt", "depth_units.json", "../scale.txt", "timescale.txt"])
 def test_the_unit_of_depth_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
     """An L515 counts quarters of millimeters, which nothing else tells."""
