@@ -202,7 +202,7 @@ class DepthVideos:
         series: Series | None = item.extra["series"]
         name = f"{item.name} {series.pattern if series else ''}"
         require_depth(item.path, name)
-        if self.calibration and self.calibration.chosen and _ALIGNED.search(name):
+        if self.calibration and self.calibration.chosen and not self.calibration.is_of_colors and _ALIGNED.search(name):
             raise DataError(
                 f"{item.path}: by its name its depth was aligned to the color camera, but of the cameras in"
                 f" {self.calibration.source} the one called {self.calibration.chosen} is taken; expected --intrinsics of the color"

@@ -24,7 +24,7 @@ from dpcli.prepare.decode.calibration_texts import (
     without_matlab_counting,
 )
 from dpcli.prepare.decode.lenses import MODEL, are_numbers, first, is_lens, lens_of_mapping, letters, require_pinhole
-from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, KinectCalibration, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import OF_COLORS, Calibration, Intrinsics, KinectCalibration, LensIntrinsics
 from dpcli.store.schema import METERS
 from dpcli.text_files import check_depth, decode_text, parse_json
 
@@ -348,14 +348,14 @@ def attached_calibration(path: Path, text: bytes) -> Calibration:
 
 def _camera_of(path: Path, data: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Returns the mapping that holds intrinsics, in small letters: the whole, the only one, one of several that are equal, or the
-    part of the depth camera; before it its name where others differ.
+    part of the depth camera; before it its name where others differ, or where that says that it is of colors.
     """
     found = list(_cameras("", data, {}))
     if not found:
         require_pinhole(path, {str(key).lower(): value for key, value in data.items()})
         raise DataError(f"{path}: {_EXPECTED}")
     if len(found) == 1 or found[0][0] == "":
-        return "", found[0][1]
+        return (found[0][0] if OF_COLORS.search(found[0][0]) else ""), found[0][1]
     depth = [(name, part) for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
     alike = depth or found
     if all(_same_camera(path, part, alike[0][1]) for _, part in alike[1:]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -24,6 +25,8 @@ _TURNED, _UPRIGHT = (
     0.2,
     0.1,
 )  # how far off the middle a principal point lies in pictures that were turned, and in those before
+OF_COLORS = re.compile("colou?r|rgb", re.IGNORECASE)  # in a camera's name
+_IF_ALIGNED = ", which is right for depth that was aligned to the colors"
 _LIKE = 0.01  # share by which cameras of frames differ that one stands for
 _ARRIVES = 1e-3  # focal lengths by which a ray may miss its pixel
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
@@ -175,7 +178,7 @@ def _off_middle(across: float, down: float) -> float:
 class Calibration:
     """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter.
 
-    chosen: what the camera is called where the file holds others, too.
+    chosen: what the camera is called where the file holds others, too, or where it is one of colors.
     """
 
     intrinsics: Intrinsics
@@ -184,6 +187,11 @@ class Calibration:
     depth_scale: float | None = None
     source: str = "the options"
     chosen: str = ""
+
+    @property
+    def is_of_colors(self) -> bool:
+        """Returns whether its name in the file says that it is a color camera's."""
+        return OF_COLORS.search(self.chosen) is not None
 
     def is_like(self, other: Calibration | None) -> bool:
         """Returns whether another camera is this one, but for what calibrating anew changes."""
@@ -250,7 +258,11 @@ class Calibration:
         declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
         declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
         declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        lines = [f"{self.source}: of its cameras the one called {self.chosen} is taken"] if self.chosen else []
+        lines = (
+            [f"{self.source}: the camera called {self.chosen} is taken{_IF_ALIGNED * self.is_of_colors}"]
+            if self.chosen
+            else []
+        )
         return lines + ([f"{self.source}: declares {', '.join(declared)}"] if declared else [])
 
 

@@ -264,7 +264,11 @@ def test_depth_aligned_to_color_is_not_of_the_depth_camera(tmp_path):
     ):
         read(folder, calibration=both)
     np.testing.assert_allclose(read(folder, calibration=color)[1].points[0], [-3.5 / 16, -2.5 / 16, 1])
-    assert f"{tmp_path / 'both.json'}: of its cameras the one called depth is taken" in both.notes()
+    assert f"{tmp_path / 'both.json'}: the camera called depth is taken" in both.notes()
+    (tmp_path / "rgb.json").write_text(json.dumps({"rgb_intrinsics": cameras["color"]}))
+    colors = read_calibration(tmp_path / "rgb.json")
+    assert "rgb_intrinsics is taken, which is right for depth that was aligned to the colors" in colors.notes()[0]
+    assert read(folder, calibration=colors)[1].points[0, 0] == pytest.approx(-3.5 / 16)
 
 
 def test_folders_of_other_names_stay(tmp_path):
