@@ -21,10 +21,7 @@ _KINECT_MODES = {  # width and height of an Azure Kinect's depth: pixels of its 
     (512, 512): (2, 0, 0),
     (1024, 1024): (1, 0, 0),
 }
-_TURNED, _UPRIGHT = (
-    0.2,
-    0.1,
-)  # how far off the middle a principal point lies in pictures that were turned, and in those before
+_TURNED, _UPRIGHT = 0.2, 0.1  # how far off the middle a principal point lies in turned pictures, and in those before
 OF_COLORS = re.compile("colou?r|rgb", re.IGNORECASE)  # in a camera's name
 _IF_ALIGNED = ", which is right for depth that was aligned to the colors"
 _LIKE = 0.01  # share by which cameras of frames differ that one stands for
@@ -43,12 +40,8 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)) or self.fx <= 0 or self.fy <= 0:
-            up = (
-                " (without its sign, fy is that of pictures that stand upright, as ICL-NUIM's do)"
-                if self.fy < 0
-                else ""
-            )
-            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}{up}")
+            upright = " (pictures that stand upright, as ICL-NUIM's do, have a positive fy)" if self.fy < 0 else ""
+            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}{upright}")
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
@@ -227,7 +220,8 @@ class Calibration:
         if not self.width and _off_middle(across, down) > _TURNED and _off_middle(*turned) < _UPRIGHT:
             raise DataError(
                 f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be that of pictures that were turned by a"
-                f" quarter into these {found} ones; expected the camera of the turned pictures: exchange fx and fy, cx and cy"
+                f" quarter into these {found} ones; expected fx and fy exchanged, and cx and cy counted from the sides that are left and"
+                " top now"
             )
         outside = not (0 <= across <= 1 + 0.5 / width and 0 <= down <= 1 + 0.5 / height)
         scaled = not self.width and abs(across - down) < _ALIKE and not _MIDDLE[0] < across < _MIDDLE[1]
@@ -258,12 +252,10 @@ class Calibration:
         declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
         declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
         declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        lines = (
-            [f"{self.source}: the camera called {self.chosen} is taken{_IF_ALIGNED * self.is_of_colors}"]
-            if self.chosen
-            else []
+        which = f"the camera called {self.chosen} is taken{_IF_ALIGNED * self.is_of_colors}"
+        return ([f"{self.source}: {which}"] if self.chosen else []) + (
+            [f"{self.source}: declares {', '.join(declared)}"] if declared else []
         )
-        return lines + ([f"{self.source}: declares {', '.join(declared)}"] if declared else [])
 
 
 class KinectCalibration(Calibration):
