@@ -40,7 +40,13 @@ class ArrayTable(TypedTable):
     def __init__(self, path: Path) -> None:
         found = _tables_of(path)
         if len(found) != 1:
-            told = f"several tables ({first_names(list(found), 5)})" if found else "no table of named columns"
+            others = [f"{name} of {first_names(list(columns), 5)}" for name, (columns, _) in read_tables(path).items()]
+            beside = f" ({first_names(others, 2)})" if others else ""
+            told = (
+                f"several tables ({first_names(list(found), 5)})"
+                if found
+                else f"no table of columns x, y and z{beside}"
+            )
             raise DataError(
                 f"{path}: holds {told}; expected one: write it as .csv or .parquet (pandas: DataFrame.to_csv)"
             )

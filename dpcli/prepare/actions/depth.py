@@ -17,7 +17,9 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.actions.depth_units import (
     doubts_of_marks,
+    doubts_of_name,
     doubts_of_place,
+    doubts_of_shape,
     doubts_of_units,
     require_byte_order,
     require_plausible,
@@ -30,14 +32,20 @@ from dpcli.prepare.decode.depth_files import (
     ARRAY_SUFFIXES,
     VIDEO_SUFFIXES,
     DepthVideo,
-    doubts_of_name,
     frame_series,
     read_depth_video,
     require_depth,
     tells_times,
 )
-from dpcli.prepare.decode.folder_listing import calibrations_below, count_suffixes, stores, walk_folders
-from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, without_rays
+from dpcli.prepare.decode.folder_listing import (
+    calibrations_below,
+    count_suffixes,
+    poses_below,
+    scales_below,
+    stores,
+    walk_folders,
+)
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project, count_blind
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Reader, Sample, natural_key, sample_of_frames
 from dpcli.prepare.recordings.recording import find_recordings, is_recording
@@ -190,26 +198,28 @@ class DepthVideos(Reader):
         series: Series | None = item.extra["series"]
         name = f"{item.name} {series.pattern if series else ''}"
         require_depth(item.path, name)
-        if self.calibration and self.calibration.chosen and _ALIGNED.search(name):
+        if self.calibration and self.calibration.chosen and not self.calibration.is_of_colors and _ALIGNED.search(name):
             raise DataError(
                 f"{item.path}: by its name its depth was aligned to the color camera, but of the cameras in"
                 f" {self.calibration.source} the one called {self.calibration.chosen} is taken; expected --intrinsics of the color"
                 " camera: save it as a file of its own"
             )
         video = self._video(item)
-        camera = self._camera(video.frames.shape[2], video.frames.shape[1], video.camera)
+        height, width = video.frames.shape[1:]
+        odd = doubts_of_shape(item.path, name, width, height)
+        camera = self._camera(width, height, video.camera)
         scale, told = self._scale(video)
         depth, notes = without_marks(video.frames)
         require_byte_order(str(item.path), depth)
         notes |= (
             doubts_of_name(name)
+            | odd
             | video.notes
-            | ({} if told else doubts_of_units(depth) or doubts_of_place(item.path, depth))
+            | ({} if told or odd else doubts_of_units(depth) or doubts_of_place(item.path, depth))
         )
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
-        notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing)}
-        depth, notes[BLIND] = without_rays(self._inverted(depth, item.path), camera)
-        unit = 1 / scale
+        depth, unit = self._inverted(depth, item.path), 1 / scale
+        notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing), BLIND: count_blind(depth, camera)}
         seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
@@ -233,7 +243,7 @@ class DepthVideos(Reader):
     def _video(self, item: Item) -> DepthVideo:
         """Returns the frames of an item, with the camera that a recording describes."""
         if not item.extra["recording"]:
-            return read_depth_video(item.path, self.stride, item.extra["series"])
+            return read_depth_video(item.path, self.stride, item.extra["series"], with_camera=not self._given_camera)
         from dpcli.prepare.recordings.depth import read_recorded_depth  # which few need, and all would wait for
 
         read, camera, scale = read_recorded_depth(
@@ -314,8 +324,15 @@ class DepthVideos(Reader):
             )
             if cameras := [one for given in self.inputs for one in calibrations_below(given)]:
                 lines.append(f"{first_names(cameras, 3)}: not read; if the camera is in there, give --intrinsics FILE")
+        if poses := [one for given in self.inputs for one in poses_below(given)]:
+            lines.append(
+                f"{first_names(poses, 3)}: not read; if the camera moved, points stay in its axes of each moment"
+            )
+        scales = [] if self._declared_scale else [one for given in self.inputs for one in scales_below(given)]
+        if scales:
+            lines.append(f"{first_names(scales, 3)}: not read; if it tells the unit of depth, give --depth-scale")
         if self.calibration:
-            lines += self.calibration.notes()
+            lines += [*self.calibration.notes(), *self._other_cameras(len(items))]
         if _FARTHEST < self.far < np.inf:
             lines.append(f"--far {self.far:g} cuts nothing, no depth camera sees so far; it is in meters")
         if not self._timed:
@@ -325,6 +342,19 @@ class DepthVideos(Reader):
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
         return lines + self._table.unnamed(items)
+
+    def _other_cameras(self, count: int) -> list[str]:
+        """Returns a line for the log where files called as the calibration that is taken for all videos lie beside some."""
+        own = Path(self.calibration.source) if self.calibration else Path()
+        below = [given.absolute().parent / one for given in self.inputs for one in calibrations_below(given)]
+        others = [one for one in below if one.name == own.name and one != own.absolute()]
+        if count < 2 or not others or not own.is_file():
+            return []
+        names = first_names([as_utf8(f"{one.parent.name}/{one.name}") for one in others], 3)
+        return [
+            f"{own}: is taken for all {count} videos, {names} for none; if these are other cameras, convert the videos of each"
+            " by itself, and join them with `dpc prepare merge`"
+        ]
 
 
 def _tells_time(item: Item) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,10 @@ _MARKED, _WELL_BELOW = 0.005, 0.97  # share of pixels that hold a mark; up to wh
 _FAR_BELOW = 0.25  # up to where they reach where the mark is no largest number of some bits
 # width by height, and share of pixels with a depth, of a lidar's points drawn into a street's picture
 _WIDE, _SPARSE = (3, 0.5)
+LIKE_VIRTUAL_KITTI = (
+    "videos of pictures as wide as those of streets, full of depths; if they are Virtual KITTI's, 100 units are a meter: give"
+    " --depth-scale 100"
+)
 LIKE_KITTI = (
     "videos of wide pictures with few depths; if they are KITTI's, 256 units are a meter: give --depth-scale 256"
 )
@@ -31,6 +36,17 @@ LIKE_TUM = "videos beside {}, a list as TUM's data sets have it; if they are of 
 UP_TO_ONE = (
     "videos of depths that end at exactly 1, as a depth buffer's or those divided by the largest do; taken for meters"
     " (--depth-scale, --far)"
+)
+_ALONG_RAY = re.compile(
+    r"distances?(?!_to_image_plane)(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid|long[ _]?throw|ahat|depth_?perspective",
+    re.IGNORECASE,
+)
+_RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
+_PANORAMA = re.compile(r"panoram|(?<![a-z])pano(?![a-z])|equirect|(?<![a-z])erp(?![a-z])", re.IGNORECASE)
+_BAND = 6  # times as wide as high: what turning lidars see, and no depth camera
+LIKE_RANGES = (
+    "videos of pictures many times as wide as high, as turning lidars' range images are, whose columns are angles and whose numbers"
+    " lengths of rays; taken for a camera's (their points are read by `dpc prepare clouds`)"
 )
 _ROWS = 16  # of a frame that are looked at
 
@@ -71,6 +87,33 @@ def _marks(frames: np.ndarray) -> np.ndarray | None:
     return (frames == 65535) | (frames >= np.iinfo(np.int32).max) if largest >= 65535 else None
 
 
+def doubts_of_name(name: str) -> dict[str, int]:
+    """Returns a note where a video's name says distances from the camera's center, or what a network makes of one picture."""
+    if said := _ALONG_RAY.search(name):
+        return {
+            f"videos that by their names hold distances from the camera ({said[0]}), taken for depth along its axis; if they are"
+            " lengths of the rays, as Hypersim's are, flat walls come out bent: divide each by that of its pixel's ray": 1
+        }
+    if said := _RELATIVE.search(name):
+        return {
+            f"videos that by their names are what a network guessed from one picture ({said[0]}): as a rule neither meters nor, as"
+            " MiDaS's, depth but its inverse; taken for depth": 1
+        }
+    return {}
+
+
+def doubts_of_shape(path: Path, name: str, width: int, height: int) -> dict[str, int]:
+    """Returns a note where pictures are so wide that no camera took them. Raises DataError where they are panoramas, by their
+    name and shape.
+    """
+    if width == 2 * height and _PANORAMA.search(name):
+        raise DataError(
+            f"{path}: by its name and its shape ({width}x{height}) it holds panoramas, whose columns are angles; expected depth of"
+            " a pinhole camera: cut views out of them (such as with py360convert's e2p), or call it otherwise if it isn't so"
+        )
+    return {LIKE_RANGES: 1} if width >= _BAND * height > _BAND else {}
+
+
 def require_byte_order(name: str, frames: np.ndarray) -> None:
     """Raises DataError when depths (T,H,W) of 16 bits have their two bytes the other way round: then neighbors differ wildly."""
     if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
@@ -95,7 +138,7 @@ def _roughness(rows: np.ndarray) -> float:
 def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
     in millimeters; the low bits of 8 may hold flags. Or when they are wide pictures with few depths, as KITTI has them of its
-    lidar; or floats of which many are 1 and none more, as where a range was divided by its end.
+    lidar; or such with many; or floats of which many are 1 and none more, as where a range was divided by its end.
     """
     middle = frames[len(frames) // 2]
     if frames.dtype.kind == "f":
@@ -103,8 +146,8 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
         return {UP_TO_ONE: 1} if several and frames.max() == 1 and ((middle > 0) & (middle < 1)).any() else {}
     if frames.dtype.itemsize != 2:
         return {}
-    if middle.shape[1] >= _WIDE * middle.shape[0] and np.count_nonzero(middle) < _SPARSE * middle.size:
-        return {LIKE_KITTI: 1}
+    if middle.shape[1] >= _WIDE * middle.shape[0]:
+        return {LIKE_KITTI if np.count_nonzero(middle) < _SPARSE * middle.size else LIKE_VIRTUAL_KITTI: 1}
     some = _some_depths(frames)
     if _mark(some) or _kinds(some) <= _KINDS:
         return {}

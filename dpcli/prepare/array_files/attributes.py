@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 UNIT_NAMES = ("units", "unit", "length_unit")
+_MODEL_NAMES = ("distortion_model", "camera_model", "lens_model", "model")  # of a lens
 _LETTERS = 100  # of a text that tells a unit
 
 
@@ -41,6 +42,17 @@ def says_unit(name: str) -> bool:
     return name.rpartition("/")[2] in UNIT_NAMES
 
 
+def says_text(name: str) -> bool:
+    """Returns whether a text of this name is read: one that tells a unit, or the model of a camera's lens."""
+    return says_unit(name) or name.rpartition("/")[2] in _MODEL_NAMES
+
+
+def model_texts(found: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Returns the texts among some, or among attributes, that tell the model of a camera's lens, each as an array of one."""
+    told = {name: one for name, one in found.items() if name.rpartition("/")[2] in _MODEL_NAMES}
+    return {name: np.asarray(text) for name, one in told.items() if (text := _text_of(one))}
+
+
 def told_units(array: Any) -> str:
     """Returns what the attribute ``units``, ``unit`` or ``length_unit`` of an HDF5 data set says, such as "mm" or "hours since
     2024-03-05"; "" without one.
@@ -71,8 +83,8 @@ def _read_attributes(*holders: Any) -> dict[str, Any]:
 
 
 def texts_about(items: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the texts that data sets of HDF5 hold whose names say that they tell a unit, by name."""
-    return {name: _text_of(item) for name, item in items.items() if says_unit(name)}
+    """Returns the texts that data sets of HDF5 hold which are read, by name."""
+    return {name: _text_of(item) for name, item in items.items() if says_text(name)}
 
 
 def _text_of(told: Any) -> str:

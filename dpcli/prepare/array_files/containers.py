@@ -15,7 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError, reading
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
-from dpcli.prepare.array_files.attributes import says_unit, texts_about
+from dpcli.prepare.array_files.attributes import says_text, texts_about
 from dpcli.prepare.array_files.mat5 import joined, read_variables
 from dpcli.prepare.array_files.netcdf_packing import unpacked
 from dpcli.prepare.array_files.safe_pickle import load_arrays
@@ -427,7 +427,7 @@ def _read_once(path: Path, _size: int, _changed: int) -> Mapping[str, Array | li
                 foreign = foreign or error
                 continue
             name = one.filename[: -len(".npy")]
-            told = not isinstance(array, list) and array.dtype.kind == "U" and array.size == 1 and says_unit(name)
+            told = not isinstance(array, list) and array.dtype.kind == "U" and array.size == 1 and says_text(name)
             if isinstance(array, list) or array.dtype.kind in "uifbM" or array.dtype.names or told:
                 arrays[name] = array
     if foreign and not any(isinstance(one, list) or one.ndim and len(one) > _ROWS_OF_CAMERA for one in arrays.values()):
@@ -436,7 +436,7 @@ def _read_once(path: Path, _size: int, _changed: int) -> Mapping[str, Array | li
 
 
 def _apart(found: dict[str, np.ndarray | list[np.ndarray]]) -> ByName[np.ndarray | list[np.ndarray]]:
-    """Returns arrays with the texts among them, which tell units, apart."""
+    """Returns arrays with the texts among them, which tell units and models of lenses, apart."""
     texts = {name: one.item() for name, one in found.items() if not isinstance(one, list) and one.dtype.kind == "U"}
     arrays = ByName({name: one for name, one in found.items() if name not in texts})
     arrays.texts = texts

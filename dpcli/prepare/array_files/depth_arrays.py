@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.array_files.attributes import attributes_of, told_lengths, told_units
+from dpcli.prepare.array_files.attributes import attributes_of, model_texts, told_lengths, told_units
 from dpcli.prepare.array_files.axes import MATRICES, are_poses
 from dpcli.prepare.array_files.containers import Unreadable, open_arrays
 from dpcli.prepare.array_files.netcdf_packing import PACKING, Unpacked
@@ -22,7 +22,7 @@ _SIZES = (  # (height, width) of depth cameras
     *((480, 640), (240, 320), (424, 512), (576, 640), (512, 512), (1024, 1024), (288, 320), (192, 256), (720, 1280)),
     *((480, 848), (400, 640), (270, 480), (360, 640), (171, 224), (172, 224), (180, 240), (800, 1280), (1080, 1920)),
 )
-_SMALL = 4096  # numbers of an array that may tell of the camera
+_SMALL = 1 << 16  # numbers of an array that may tell of the camera
 _LEAST, _TALL = 32, 4  # pixels; how much higher than wide no picture is
 _WHOLE = 50  # numbers above are no meters
 _MARK = 65535  # what whole numbers have where nothing was seen, see `depth_units.without_marks`
@@ -96,11 +96,12 @@ def archived_depth(path: Path) -> ArchivedDepth:
         others = {k: one for k, one in arrays.items() if k != chosen and not isinstance(one, Unreadable)}
         small = {name: np.asarray(one[()]) for name, one in others.items() if np.prod(one.shape) <= _SMALL}
         units = {name: told_units(others[name]) for name in small}
+        small |= model_texts(opened.texts)
         return ArchivedDepth(
             depth,
             small,
             units,
-            tuple(name for name in others if name not in small),
+            tuple(name for name in others if name not in units),
             _told_by_attributes(arrays[chosen]),
             told_lengths(opened, chosen),
         )
@@ -118,9 +119,10 @@ def _marked(array: Any) -> np.ndarray:
 
 
 def _told_by_attributes(array: Any) -> dict[str, np.ndarray]:
-    """Returns the numbers among the attributes of HDF5's depth and of its group."""
-    found = {name: np.asarray(one) for name, one in attributes_of(array).items() if name not in PACKING}
-    return {name: one for name, one in found.items() if one.dtype.kind in "uif" and one.size}
+    """Returns the numbers among the attributes of HDF5's depth and of its group, and the model of a lens."""
+    told = attributes_of(array)
+    found = {name: np.asarray(one) for name, one in told.items() if name not in PACKING}
+    return {name: one for name, one in found.items() if one.dtype.kind in "uif" and one.size} | model_texts(told)
 
 
 def _of_matlab(path: Path, array: np.ndarray) -> np.ndarray:

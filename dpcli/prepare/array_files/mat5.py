@@ -15,7 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import PACKED_AT_MOST, ROOM
-from dpcli.prepare.array_files.attributes import says_unit
+from dpcli.prepare.array_files.attributes import says_text, says_unit
 
 _HEADER = 128
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # as stored
@@ -127,7 +127,7 @@ def _of_variable(content: Bytes, order: str, above: str = "") -> dict[str, np.nd
     """Returns what `read_variables` does of one variable, or of the field of a struct, whose whole name is ``above``."""
     name, values = _matrix(content, order)
     name = above or name
-    if values is None and says_unit(name) and (text := _text(content, order)):
+    if values is None and says_text(name) and (text := _text(content, order)):
         values = np.array(text)
     return {name: values} if values is not None else _fields(content, order, name)
 

@@ -26,7 +26,7 @@ from dpcli.prepare.decode.calibration_texts import (
     without_matlab_counting,
 )
 from dpcli.prepare.decode.lenses import MODEL, are_numbers, first, is_lens, lens_of_mapping, letters, require_pinhole
-from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics, KinectCalibration, LensIntrinsics
+from dpcli.prepare.decode.pinhole_camera import OF_COLORS, Calibration, Intrinsics, KinectCalibration, LensIntrinsics
 from dpcli.store.schema import METERS
 from dpcli.text_files import check_depth, decode_text, parse_json
 
@@ -96,30 +96,58 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def camera_of_arrays(
-    path: Path, arrays: dict[str, np.ndarray]
+    path: Path, arrays: dict[str, np.ndarray], frames: int, *, with_camera: bool
 ) -> tuple[Calibration | None, float | None, tuple[str, ...]]:
-    """Returns the camera and the raw units per meter that small arrays beside those of depth tell, None where they don't, and
-    the names of the arrays that tell nothing of these.
+    """Returns the camera and the raw units per meter that small arrays beside those of so many frames of depth tell, None where
+    they don't, and the names of the arrays that tell nothing of these. with_camera: whether the camera is asked for.
     """
+    arrays, apart = _of_all_frames(arrays, frames)
     small = {name: array for name, array in arrays.items() if array.size <= _MOST_NUMBERS and array.ndim <= 2}
     told = {k.lower(): v.item() if v.size == 1 else v.tolist() for k, v in small.items() if v.dtype.kind in "uifU"}
-    camera = _of_mapping(path, told) if _holds_camera(told) else None
+    known = _holds_camera(told)
+    camera = _of_mapping(path, told) if known and with_camera else None
     scale = camera.depth_scale if camera else _depth_scale(path, told, {})
-    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *MODEL, "width", "height") if camera else ()
-    unread = (k for k in arrays if k.lower() not in about and not _is_scale(k.lower()))
-    return camera, scale, tuple(k for k in unread if not (camera and is_lens(k.lower())))
+    about = (*_MATRIX, *_FX, *_FY, *_CX, *_CY, *MODEL, "width", "height") if known else ()
+    unread = [k for k in arrays if k.lower() not in about and not _is_scale(k.lower())]
+    return camera, scale, (*(k for k in unread if not (known and is_lens(k.lower()))), *apart)
+
+
+def _of_all_frames(arrays: dict[str, np.ndarray], frames: int) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Returns arrays with the camera of the first frame where one of each frame is told and all are equal, and what is said of
+    those that differ, which aren't among them.
+    """
+    found, apart = {}, []
+    for name, array in arrays.items():
+        several = (
+            frames > 1
+            and array.ndim
+            and len(array) == frames
+            and array.shape not in ((3, 3), (4, 4), (3, 4), (4,), (9,))
+        )
+        if not several or name.lower() not in (*_MATRIX, *_FX, *_FY, *_CX, *_CY):
+            found[name] = array
+        elif np.allclose(array, array[:1], rtol=1e-4):
+            found[name] = array[0]
+        else:
+            apart.append(f"{name}, which differs from frame to frame")
+    return found, apart
 
 
 def camera_of_any(
-    path: Path, further: Sequence[dict[str, np.ndarray]], arrays: dict[str, np.ndarray]
+    path: Path,
+    further: Sequence[dict[str, np.ndarray]],
+    arrays: dict[str, np.ndarray],
+    frames: int,
+    *,
+    with_camera: bool,
 ) -> tuple[tuple[Calibration | None, float | None, tuple[str, ...]], dict[str, np.ndarray]]:
     """Returns what `camera_of_arrays` does of arrays and the first of some further ones that contradict neither them nor each
     other, and these. Raises DataError where the last do, too.
     """
     for more in further[:-1]:
         with suppress(DataError):
-            return camera_of_arrays(path, {**more, **arrays}), more
-    return camera_of_arrays(path, {**further[-1], **arrays}), further[-1]
+            return camera_of_arrays(path, {**more, **arrays}, frames, with_camera=with_camera), more
+    return camera_of_arrays(path, {**further[-1], **arrays}, frames, with_camera=with_camera), further[-1]
 
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:
@@ -315,14 +343,14 @@ def attached_calibration(path: Path, text: bytes) -> Calibration:
 
 def _camera_of(path: Path, data: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Returns the mapping that holds intrinsics, in small letters: the whole, the only one, one of several that are equal, or the
-    part of the depth camera; before it its name where others differ.
+    part of the depth camera; before it its name where others differ, or where that says that it is of colors.
     """
     found = list(_cameras("", data, {}))
     if not found:
         require_pinhole(path, {str(key).lower(): value for key, value in data.items()})
         raise DataError(f"{path}: {_EXPECTED}")
     if len(found) == 1 or found[0][0] == "":
-        return "", found[0][1]
+        return (found[0][0] if OF_COLORS.search(found[0][0]) else ""), found[0][1]
     depth = [(name, part) for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
     alike = depth or found
     if all(_same_camera(path, part, alike[0][1]) for _, part in alike[1:]):

@@ -41,8 +41,6 @@ _INFRARED = re.compile(
     r"(^|[^a-z])(n?ir|lwir|infra(red|[0-9])?|thermal|amplitudes?|ab_?images?|active_?brightness)([^a-z]|$)",
     re.IGNORECASE,
 )
-_ALONG_RAY = re.compile(r"distances?(?![a-z])|depth_meters|ray_?(length|depth)|radial|euclid", re.IGNORECASE)
-_RELATIVE = re.compile(r"midas|(?<![a-z])dpt[-_](beit|swin|large|hybrid|levit|next)|marigold", re.IGNORECASE)
 _BRIGHTNESS = re.compile(r"[-_.]ab$", re.IGNORECASE)  # what HoloLens puts beside each frame of depth
 # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY_NOISE, _COLORED_SHARE = 24, 0.02
@@ -60,6 +58,7 @@ SPREAD = (
 _MARGINS = "says that margins of its frames are cut off; write it again without them: ffmpeg -i IN -c:v ffv1 depth.mkv"
 LEFT_OUT = "frames without bytes, which the recording program left out"
 TURNED = "videos turned upright as their files say; --fov, --fx and the like are those of the turned pictures"
+ZOOMS = "videos whose frames have files with different cameras, of which the first counts (--fx ... gives another)"
 JOINED = "videos behind the first in one file, whose frames may not be read; join them by ffmpeg -f concat instead"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
@@ -356,21 +355,6 @@ def require_depth(path: Path, name: str) -> None:
         )
 
 
-def doubts_of_name(name: str) -> dict[str, int]:
-    """Returns a note where a video's name says distances from the camera's center, or what a network makes of one picture."""
-    if said := _ALONG_RAY.search(name):
-        return {
-            f"videos that by their names hold distances from the camera ({said[0]}), taken for depth along its axis; if they are"
-            " lengths of the rays, as Hypersim's are, flat walls come out bent: divide each by that of its pixel's ray": 1
-        }
-    if said := _RELATIVE.search(name):
-        return {
-            f"videos that by their names are what a network guessed from one picture ({said[0]}): as a rule neither meters nor, as"
-            " MiDaS's, depth but its inverse; taken for depth": 1
-        }
-    return {}
-
-
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame, (H,W) or (H,W,1), by its header where it has one."""
     try:
@@ -399,10 +383,8 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
     return depth_frames(path, map_npy(path) if path.suffix.lower() == ".npy" else archived_depth(path).depth, stride)
 
 
-def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any]:
-    """Returns what the arrays beside those of so many frames of depth tell, and the attributes of these, by the fields of a
-    `DepthVideo`.
-    """
+def _told_beside(path: Path, found: ArchivedDepth, frames: int, with_camera: bool) -> dict[str, Any]:
+    """Returns what the arrays beside those of so many frames of depth tell, and their attributes, by the fields of a `DepthVideo`."""
     from dpcli.prepare.decode.calibration import camera_of_any
     from dpcli.prepare.times_beside import seconds_beside
 
@@ -412,7 +394,7 @@ def _told_beside(path: Path, found: ArchivedDepth, frames: int) -> dict[str, Any
     times = [(name, seconds_beside(name, found.small[name], found.units[name])) for name in clocks if frames > 1]
     name, time = next(((name, seconds) for name, seconds in times if seconds is not None), ("", None))
     further = ({**attributes, **own}, attributes, own, {})  # a unit may be that of numbers once they are scaled
-    (camera, scale, rest), used = camera_of_any(path, further, found.small)
+    (camera, scale, rest), used = camera_of_any(path, further, found.small, frames, with_camera=with_camera)
     rest += tuple(f"attribute {one}" for one in attributes if one not in used)
     scale = scale if whole else 1 / METERS[unit] if unit not in ("", "m") else None  # fractions are lengths
     unread = [one for one in (*rest, *found.large) if one != name and one not in attributes]
@@ -428,15 +410,16 @@ def tells_times(path: Path) -> bool:
         with open_arrays(path) as arrays:
             if not any(says_times(name.rpartition("/")[2]) for name in arrays):
                 return False
-        return _read_file(path, 1).time is not None
+        return _read_file(path, 1, with_camera=False).time is not None
     except DataError:  # reading says so
         return False
 
 
-def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
-    """Reads any depth video: a video file, a file of arrays, or a folder of frames, of which ``series`` says which.
-
-    ``stride`` keeps every n-th frame. Raises DataError when it can't be read, or holds no frame.
+def read_depth_video(
+    path: Path, stride: int = 1, series: Series | None = None, *, with_camera: bool = True
+) -> DepthVideo:
+    """Reads any depth video: a video file, a file of arrays, or a folder of frames, of which ``series`` says which; of every
+    ``stride``-th frame. with_camera: whether a camera that it tells is wanted. Raises DataError when nothing can be read.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -449,14 +432,16 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         turned = tiff.read_tags(data).get(tiff.ORIENTATION, (1,))[0] != 1  # which OpenCV does
         known = {WHITE_AT_ZERO: int(has_white_at_zero(data)), TURNED: int(turned)}
         told: dict[str, Any] = {"notes": {what: count for what, count in known.items() if count}}
-        told = _told_beside(first, archived_depth(first), 1) if first.suffix.lower() in ARRAY_SUFFIXES[1:] else told
+        if first.suffix.lower() in ARRAY_SUFFIXES[1:]:
+            told, last = (_told_beside(one, archived_depth(one), 1, with_camera) for one in (first, series.paths[-1]))
+            told["notes"] |= {ZOOMS: 1} if told["camera"] and not told["camera"].is_like(last["camera"]) else {}
         video = DepthVideo(read_frames(series, stride), **{**told, "time": None if times is None else times[::stride]})
         bits = significant_bits(first) if first.suffix.lower() == ".png" and video.frames.dtype == np.uint16 else 16
         if bits < 16 and video.frames.max(initial=0) >= 1 << bits:
             video.notes[SPREAD.format(bits)] = 1
     elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
         with stand_ins_named(path):
-            video = _read_file(path, stride)
+            video = _read_file(path, stride, with_camera)
     else:
         kinds = ", ".join((*ARRAY_SUFFIXES, *VIDEO_SUFFIXES))
         raise DataError(f"{path}: unknown kind; expected a folder of images, or one of {kinds}")
@@ -465,12 +450,12 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
     return video
 
 
-def _read_file(path: Path, stride: int) -> DepthVideo:
+def _read_file(path: Path, stride: int, with_camera: bool) -> DepthVideo:
     """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
     if path.suffix.lower() in ARRAY_SUFFIXES[1:]:
         found = archived_depth(path)
         frames = depth_frames(path, found.depth)
-        told = _told_beside(path, found, len(frames))
+        told = _told_beside(path, found, len(frames), with_camera)
         if told["time"] is not None:
             told["time"] = told["time"][::stride]
         return DepthVideo(np.ascontiguousarray(frames[::stride]), **told)
@@ -488,7 +473,7 @@ def _read_file(path: Path, stride: int) -> DepthVideo:
     }
     notes = {what: count for what, count in told.items() if count}
     camera = None
-    if path.suffix.lower() == ".mkv" and (text := attached_json(path)):
+    if with_camera and path.suffix.lower() == ".mkv" and (text := attached_json(path)):
         from dpcli.prepare.decode.calibration import attached_calibration
 
         try:

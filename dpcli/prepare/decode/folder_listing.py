@@ -17,6 +17,10 @@ _OF_CAMERAS = (".json", ".txt", ".csv", ".yaml", ".yml", ".xml", ".ini", ".npy",
 _CAMERA = re.compile(
     r"intrinsic|calib|(^|[^a-z])cam(era)?s?[-_ ]?(matri|info|param|intr)|(^|[-_.])(k|cameras?)$", re.IGNORECASE
 )
+_POSE = re.compile(r"(^|[^a-z])(poses?|traj(ectory)?|odom(etry)?|ground[-_ ]?truth)([^a-z]|$)", re.IGNORECASE)
+_SCALE = re.compile(r"depth[-_ ]?(map)?[-_ ]?(scal(e|ing)|units?|factor)|^(scale|units?)$", re.IGNORECASE)
+_OF_OTHERS = re.compile("extrin|colou?r|rgb", re.IGNORECASE)  # that no depth is made points of
+_POSES = re.compile(r"^poses?$", re.IGNORECASE)
 _CAMERAS = re.compile(r"intrinsics?$|^cameras?$|^calib", re.IGNORECASE)  # folders of them
 
 
@@ -72,19 +76,36 @@ def named_below(root: Path, paths: Sequence[Path], kind: str) -> dict[str, Path]
 
 def calibrations_below(root: Path) -> list[str]:
     """Returns the files that by their names describe a camera, below a folder, or beside one that holds none: one of each folder."""
-    places = [(folder, names) for folder, _, names in walk_folders(root)] if root.is_dir() else []
+    return _named_alike(root, _OF_CAMERAS, _CAMERA, _CAMERAS)
+
+
+def poses_below(root: Path) -> list[str]:
+    """Returns the files that by their names tell how a camera moved, as `calibrations_below` does."""
+    return _named_alike(root, (*_OF_CAMERAS, ".log", ".npz"), _POSE, _POSES)
+
+
+def scales_below(root: Path) -> list[str]:
+    """Returns the files that by their names tell the unit of depth, as `calibrations_below` does."""
+    return _named_alike(root, (".txt", ".json", ".csv", ".yaml", ".yml", ".npy"), _SCALE, re.compile("$^"))
+
+
+def _named_alike(root: Path, suffixes: tuple[str, ...], names: re.Pattern[str], folders: re.Pattern[str]) -> list[str]:
+    """Returns one file of each folder that itself or whose folder is called so."""
+    places = [(folder, own) for folder, _, own in walk_folders(root)] if root.is_dir() else []
     if above := next((own for own in os.walk(root.absolute().parent)), None):
         places.append((above[0], above[2]))
     found: dict[str, list[str]] = {}
-    for folder, names in places:
-        known = _CAMERAS.search(os.path.basename(folder)) is not None
-        for name in names:
+    for folder, own in places:
+        known = folders.search(os.path.basename(folder)) is not None
+        for name in own:
             stem, suffix = os.path.splitext(name)
-            if suffix.lower() in _OF_CAMERAS and not is_hidden(name) and (known or _CAMERA.search(stem)):
+            if suffix.lower() in suffixes and not is_hidden(name) and (known or names.search(stem)):
                 found.setdefault(folder, []).append(name)
-    return [
-        os.path.relpath(os.path.join(folder, min(names)), root.absolute().parent) for folder, names in found.items()
-    ]
+    chosen = {
+        folder: min(own, key=lambda name: (_OF_OTHERS.search(name) is not None, "depth" not in name.lower(), name))
+        for folder, own in found.items()
+    }
+    return [os.path.relpath(os.path.join(*one), root.absolute().parent) for one in sorted(chosen.items())]
 
 
 def _leads_above(path: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,6 +21,10 @@ _KINECT_MODES = {  # width and height of an Azure Kinect's depth: pixels of its 
     (512, 512): (2, 0, 0),
     (1024, 1024): (1, 0, 0),
 }
+_TURNED, _UPRIGHT = 0.2, 0.1  # how far off the middle a principal point lies in turned pictures, and in those before
+OF_COLORS = re.compile("colou?r|rgb", re.IGNORECASE)  # in a camera's name
+_IF_ALIGNED = ", which is right for depth that was aligned to the colors"
+_LIKE = 0.01  # share by which cameras of frames differ that one stands for
 _ARRIVES = 1e-3  # focal lengths by which a ray may miss its pixel
 _MIDDLE, _ALIKE = (0.35, 0.7), 0.06  # where a principal point lies, as shares of the sides; by how much these differ
 
@@ -35,7 +40,8 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}")
+            upright = " (pictures that stand upright, as ICL-NUIM's do, have a positive fy)" if self.fy < 0 else ""
+            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}{upright}")
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
@@ -89,12 +95,11 @@ def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -
     return found.reshape(len(y), len(x), 2)
 
 
-def without_rays(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, int]:
-    """Returns depth (T,H,W) with 0 where the lens sends no ray, and how many pixels had a depth there."""
+def count_blind(depth: np.ndarray, intrinsics: Intrinsics) -> int:
+    """Returns how many pixels have a depth in frames (T,H,W) where the lens sends no ray, which `back_project` leaves out."""
     height, width = depth.shape[1:]
-    reached = ~np.isnan(pixel_rays(height, width, intrinsics)[:, 0]).reshape(height, width)
-    count = 0 if reached.all() else int(np.count_nonzero(depth[:, ~reached] > 0))
-    return (np.where(reached, depth, depth.dtype.type(0)) if count else depth), count
+    blind = np.isnan(pixel_rays(height, width, intrinsics)[:, 0]).reshape(height, width)
+    return int(np.count_nonzero(depth[:, blind] > 0)) if blind.any() else 0
 
 
 @lru_cache(maxsize=8)
@@ -108,7 +113,7 @@ def back_project(
     depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turns depth frames into points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in
-    near..far.
+    near..far that a ray reaches.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
     order within each frame, frames one after the other; counts i64 (T) of points per frame.
@@ -121,7 +126,9 @@ def back_project(
     frames, height, width = depth.shape
     rays = _complex_rays(height, width, intrinsics)
     # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
-    seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
+    reached = ~np.isnan(rays.real)
+    reached = None if reached.all() else reached
+    seen = [_seen(frame, np.float32(unit), near, far, reached) for frame in depth.reshape(frames, height * width)]
     counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
@@ -135,9 +142,13 @@ def back_project(
     return points, counts
 
 
-def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
-    pixels = np.flatnonzero(frame > 0)
+def _seen(
+    frame: np.ndarray, unit: np.float32, near: float, far: float, reached: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P). reached: which
+    pixels a ray reaches, None for all.
+    """
+    pixels = np.flatnonzero(frame > 0) if reached is None else np.flatnonzero((frame > 0) & reached)
     if near > 0 or far < np.inf:
         z = _lengths(frame, pixels, unit)
         pixels = pixels[(z >= near) & (z <= far)]
@@ -152,11 +163,15 @@ def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndar
     return z
 
 
+def _off_middle(across: float, down: float) -> float:
+    return abs(across - 0.5) + abs(down - 0.5)
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter.
 
-    chosen: what the camera is called where the file holds others, too.
+    chosen: what the camera is called where the file holds others, too, or where it is one of colors.
     """
 
     intrinsics: Intrinsics
@@ -166,11 +181,23 @@ class Calibration:
     source: str = "the options"
     chosen: str = ""
 
+    @property
+    def is_of_colors(self) -> bool:
+        """Returns whether its name in the file says that it is a color camera's."""
+        return OF_COLORS.search(self.chosen) is not None
+
+    def is_like(self, other: Calibration | None) -> bool:
+        """Returns whether another camera is this one, but for what calibrating anew changes."""
+        if other is None:
+            return False
+        pairs = ((getattr(one.intrinsics, name) for name in ("fx", "fy", "cx", "cy")) for one in (self, other))
+        return np.allclose(*map(list, pairs), rtol=_LIKE)
+
     def of_pictures(self, width: int, height: int) -> Intrinsics:
         """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
 
-        Raises DataError when they are of another shape, when the principal point lies outside of the pictures, or when a focal
-        length can't be one in pixels.
+        Raises DataError when they are of another shape, when the principal point lies outside of the pictures or is that of turned ones,
+        or when a focal length can't be one in pixels.
         """
         own, found = f"{self.width}x{self.height}", f"{width}x{height}"
         camera = self.intrinsics
@@ -189,6 +216,13 @@ class Calibration:
                 f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
             )
         across, down = (camera.cx + 0.5) / width, (camera.cy + 0.5) / height
+        turned = ((camera.cy + 0.5) / width, (camera.cx + 0.5) / height)
+        if not self.width and _off_middle(across, down) > _TURNED and _off_middle(*turned) < _UPRIGHT:
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be that of pictures that were turned by a"
+                f" quarter into these {found} ones; expected fx and fy exchanged, and cx and cy counted from the sides that are left and"
+                " top now"
+            )
         outside = not (0 <= across <= 1 + 0.5 / width and 0 <= down <= 1 + 0.5 / height)
         scaled = not self.width and abs(across - down) < _ALIKE and not _MIDDLE[0] < across < _MIDDLE[1]
         if outside or scaled:
@@ -218,8 +252,10 @@ class Calibration:
         declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
         declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
         declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
-        lines = [f"{self.source}: of its cameras the one called {self.chosen} is taken"] if self.chosen else []
-        return lines + ([f"{self.source}: declares {', '.join(declared)}"] if declared else [])
+        which = f"the camera called {self.chosen} is taken{_IF_ALIGNED * self.is_of_colors}"
+        return ([f"{self.source}: {which}"] if self.chosen else []) + (
+            [f"{self.source}: declares {', '.join(declared)}"] if declared else []
+        )
 
 
 class KinectCalibration(Calibration):

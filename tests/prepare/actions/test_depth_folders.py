@@ -264,7 +264,11 @@ def test_depth_aligned_to_color_is_not_of_the_depth_camera(tmp_path):
     ):
         read(folder, calibration=both)
     np.testing.assert_allclose(read(folder, calibration=color)[1].points[0], [-3.5 / 16, -2.5 / 16, 1])
-    assert f"{tmp_path / 'both.json'}: of its cameras the one called depth is taken" in both.notes()
+    assert f"{tmp_path / 'both.json'}: the camera called depth is taken" in both.notes()
+    (tmp_path / "rgb.json").write_text(json.dumps({"rgb_intrinsics": cameras["color"]}))
+    colors = read_calibration(tmp_path / "rgb.json")
+    assert "rgb_intrinsics is taken, which is right for depth that was aligned to the colors" in colors.notes()[0]
+    assert read(folder, calibration=colors)[1].points[0, 0] == pytest.approx(-3.5 / 16)
 
 
 def test_folders_of_other_names_stay(tmp_path):
@@ -327,6 +331,49 @@ def test_a_camera_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
     told = [reader.summary(reader.items()) for reader in readers]
     said = f"{'scene/' if name[0] != '.' else ''}{name.removeprefix('../')}: not read; if the camera is in there"
     assert [any(line.startswith(said) for line in lines) for lines in told] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "name", ["../groundtruth.txt", "frame-000000.pose.txt", "../pose/0.txt", "odometry.csv", "noposes.txt"]
+)
+def test_poses_beside_the_frames_that_are_not_read_are_named(tmp_path, name):
+    folder = write(tmp_path / "scene" / "depth", **{"000": depth(1000), "001": depth(1001)})
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("0 0 0 0 0 0 0 1")
+    reader = DepthVideos(inputs=(tmp_path / "scene",), fov=60)
+    where = "scene/" if name[:2] == ".." else "scene/depth/"
+    told = f"{where}{name.removeprefix('../')}: not read; if the camera moved, points stay in its axes of each moment"
+    assert (told in reader.summary(reader.items())) is (name != "noposes.txt")
+
+
+def test_the_camera_of_one_video_is_not_that_of_all(tmp_path):
+    """Two Kinects, each with its own calibration beside its pictures, and ScanNet's files of intrinsics."""
+    for number in (1, 2):
+        write(tmp_path / f"cam{number}" / "depth", **{str(t): depth(1000 + t) for t in (0, 1)})
+        text = json.dumps({"fx": 10.0 * number, "fy": 10.0 * number, "cx": 3.5, "cy": 2.5})
+        (tmp_path / f"cam{number}" / "intrinsics.json").write_text(text)
+    first = read_calibration(tmp_path / "cam1" / "intrinsics.json")
+    reader = DepthVideos(inputs=(tmp_path,), calibration=first)
+    assert any("for all 2 videos, cam2/intrinsics.json for none" in line for line in reader.summary(reader.items()))
+    alone = DepthVideos(inputs=(tmp_path / "cam1",), calibration=first)
+    assert not any("for none" in line for line in alone.summary(alone.items()))
+    (tmp_path / "cam1" / "intrinsics.json").unlink()
+    for name in ("extrinsic_color", "extrinsic_depth", "intrinsic_color", "intrinsic_depth"):
+        (tmp_path / "cam1" / f"{name}.txt").write_text("1 0 0\n0 1 0\n0 0 1\n")
+    guess = DepthVideos(inputs=(tmp_path / "cam1",))
+    assert any(line.startswith("cam1/intrinsic_depth.txt: not read") for line in guess.summary(guess.items()))
+
+
+@pytest.mark.parametrize("name", ["../depth_scale.txt", "depth_units.json", "../scale.txt", "timescale.txt"])
+def test_the_unit_of_depth_beside_the_frames_that_is_not_read_is_named(tmp_path, name):
+    """An L515 counts quarters of millimeters, which nothing else tells."""
+    folder = write(tmp_path / "scene" / "depth", **{"000": depth(1000), "001": depth(1001)})
+    (folder / name).write_text("0.00025")
+    told = f"scene/{'' if name[:2] == '..' else 'depth/'}{name.removeprefix('../')}: not read; if it tells the unit of depth,"
+    for scale in (None, 4000.0):
+        reader = DepthVideos(inputs=(tmp_path / "scene",), depth_scale=scale)
+        lines = reader.summary(reader.items())
+        assert any(line.startswith(told) for line in lines) is (scale is None and name != "timescale.txt")
 
 
 def test_a_topic_without_a_recording_is_refused(tmp_path):

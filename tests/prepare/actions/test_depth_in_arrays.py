@@ -5,8 +5,11 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from scipy.io import savemat
 
+from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.decode.depth_files import ZOOMS
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
 FRAMES = 8
@@ -120,3 +123,50 @@ def test_large_arrays_beside_depth_are_named(tmp_path):
     for form in ("h5", "npz"):
         _, notes = read(write(tmp_path / f"a.{form}", {"depth": DEPTH, "mask": DEPTH > 1000}))
         assert "arrays that are not read (mask)" in notes
+
+
+MATRIX = np.array([[40, 0, 23.5], [0, 40, 17.5], [0, 0, 1.0]])
+EACH = np.tile(MATRIX, (FRAMES, 1, 1))
+
+
+@pytest.mark.parametrize("form", ["v.npz", "v.h5"])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"K": EACH},
+        {"intrinsics": np.tile([40, 40, 23.5, 17.5], (FRAMES, 1))},
+        {"K": EACH.reshape(FRAMES, 9)},
+        {axis: np.full(FRAMES, value) for axis, value in (("fx", 40.0), ("fy", 40.0), ("cx", 23.5), ("cy", 17.5))},
+    ],
+)
+def test_a_camera_told_for_every_frame_is_used_where_all_are_equal(tmp_path, form, camera):
+    path = write(tmp_path / form, {"depth": DEPTH, **camera})
+    sequence, notes = read(path)
+    z = DEPTH[0, 0, 0] / 1000
+    np.testing.assert_allclose(sequence.points[0], [-23.5 / 40 * z, -17.5 / 40 * z, z], rtol=1e-6)
+    assert not notes
+    changing = {
+        name: values + np.arange(FRAMES).reshape(-1, *[1] * (values.ndim - 1)) for name, values in camera.items()
+    }
+    assert "which differs from frame to frame" in read(write(tmp_path / f"c{form}", {"depth": DEPTH, **changing}))[1]
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.0, False), (0.01, False), (5.0, True)])
+def test_cameras_that_files_of_single_frames_tell_are_compared(tmp_path, step, told):
+    for frame in range(3):
+        np.savez(tmp_path / f"{frame}.npz", depth=DEPTH[frame], K=MATRIX + np.diag([step * frame, step * frame, 0]))
+    sequence, notes = read(tmp_path)
+    assert (ZOOMS in notes) is told
+    assert sequence.points[0, 0] == pytest.approx(-23.5 / 40 * DEPTH[0, 0, 0] / 1000)
+
+
+@pytest.mark.parametrize("form", ["v.npz", "v.h5", "v.mat"])
+@pytest.mark.parametrize("lens", [{"distortion_model": "equidistant", "D": np.full(4, 0.01)}, {"xi": np.array([1.2])}])
+def test_a_fisheye_beside_depth_is_refused_unless_a_camera_is_given(tmp_path, form, lens):
+    data = {"depth": DEPTH, "K": MATRIX, **lens}
+    if form == "v.mat":
+        savemat(tmp_path / form, data | {"depth": np.moveaxis(DEPTH, 0, -1)})
+    path = tmp_path / form if form == "v.mat" else write(tmp_path / form, data)
+    with pytest.raises(DataError, match=r"its lens is of (model equidistant|xi .*1.2).*, of a fisheye or the like"):
+        read(path)
+    assert read(path, fov=60)[0].points.shape[1] == 3

@@ -10,7 +10,14 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
-from dpcli.prepare.actions.depth_units import LIKE_KITTI, UP_TO_ONE, require_plausible, without_marks
+from dpcli.prepare.actions.depth_units import (
+    LIKE_KITTI,
+    LIKE_RANGES,
+    LIKE_VIRTUAL_KITTI,
+    UP_TO_ONE,
+    require_plausible,
+    without_marks,
+)
 from dpcli.prepare.decode.depth_files import SPREAD
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.decode.pinhole_camera import Calibration, Intrinsics
@@ -108,7 +115,16 @@ def test_wide_pictures_with_few_depths_may_be_those_of_kitti(tmp_path):
     for scale in (256, 1000):
         assert not sample_of(tmp_path / "v.npy", wide, depth_scale=scale).notes
     assert not sample_of(tmp_path / "v.npy", wide[:, :, :100]).notes
-    assert not sample_of(tmp_path / "v.npy", np.where(wide == 0, 5001, wide)).notes
+    assert sample_of(tmp_path / "v.npy", np.where(wide == 0, 5001, wide)).notes == {LIKE_VIRTUAL_KITTI: 1}
+
+
+def test_pictures_of_angles_are_no_cameras(tmp_path):
+    """Depth of Structured3D and range images of Ouster's driver would be flat pictures before a camera."""
+    with pytest.raises(DataError, match=r"by its name and its shape \(96x48\) it holds panoramas.*cut views out"):
+        sample_of(tmp_path / "panorama.npy", np.tile(SCENE, (1, 1, 2))[:, :, :96])
+    assert not sample_of(tmp_path / "panorama.npy", SCENE).notes
+    assert not sample_of(tmp_path / "v.npy", np.tile(SCENE, (1, 1, 2))[:, :, :96]).notes
+    assert sample_of(tmp_path / "v.npy", np.tile(SCENE[:, :16], (1, 1, 4))).notes == {LIKE_RANGES: 1}
 
 
 def test_floats_that_end_at_one_may_be_shares_of_a_range(tmp_path):
@@ -123,6 +139,9 @@ def test_floats_that_end_at_one_may_be_shares_of_a_range(tmp_path):
     ("name", "said"),
     [
         ("frame.{}.depth_meters", "depth_meters"),
+        ("Depth Long Throw_{}", "Long Throw"),
+        ("DepthPerspective_{}", "DepthPerspective"),
+        ("distance_to_image_plane_{}", ""),
         ("distance_{}", "distance"),
         ("{}-dpt_beit_large_512", "dpt_beit"),
         ("depth_{}", ""),

@@ -283,6 +283,16 @@ def test_another_shape_and_a_center_outside_are_refused(tmp_path):
         read_calibration(tmp_path / "k.json").of_pictures(320, 240)
 
 
+def test_the_camera_of_pictures_that_were_turned_is_refused():
+    """As where a phone's depth was turned upright: 4:3 pictures hold the principal point of either."""
+    wide = Calibration(Intrinsics(610.0, 612.0, 322.0, 236.0), source="k.json")
+    with pytest.raises(DataError, match=r"turned by a quarter into these 480x640 ones.*fx and fy exchanged"):
+        wide.of_pictures(480, 640)
+    assert wide.of_pictures(640, 480) == wide.intrinsics
+    off = Intrinsics(610.0, 612.0, 380.0, 120.0)  # of a picture cut below
+    assert Calibration(off).of_pictures(640, 480) == off
+
+
 def test_fractions_of_a_picture_are_no_pixels():
     with pytest.raises(DataError, match="seems to be a fraction of the picture; expected pixels of these 640x480"):
         Calibration(Intrinsics(0.9, 1.2, 0.5, 0.5), source="k.json").of_pictures(640, 480)

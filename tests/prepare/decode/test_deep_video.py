@@ -16,6 +16,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import BLIND, DepthVideos
 from dpcli.prepare.decode.depth_files import TURNED, read_depth_video, rising_times
+from dpcli.prepare.decode.pinhole_camera import LensIntrinsics
 from dpcli.prepare.decode.video_streams import how_shown, video_streams
 
 RNG = np.random.default_rng(0)
@@ -174,18 +175,24 @@ def test_the_calibration_that_an_azure_kinect_attaches_is_used(tmp_path):
 
 
 def test_what_of_an_azure_kinect_can_not_be_used_is_told(tmp_path):
-    depth = np.full((1, 512, 512), 1500, np.uint16)
-    wide = DepthVideos(inputs=(kinect_recording(tmp_path / "wide.mkv", depth),))
-    read = wide.read(wide.items()[0], np.random.default_rng(0))
-    assert read.notes[BLIND] == depth.size - len(read.sequence.points) > 10_000  # its corners lie outside of the lens
-    assert np.abs(read.sequence.points).max() < 15
-    small = DepthVideos(inputs=(kinect_recording(tmp_path / "small.mkv", depth[:, ::8, ::8]),))
+    depth = np.full((1, 64, 64), 1500, np.uint16)
+    small = DepthVideos(inputs=(kinect_recording(tmp_path / "small.mkv", depth),))
     with pytest.raises(
         DataError, match="whose depth has 640x576, .* these pictures have 64x64; if they were transformed"
     ):
         small.read(small.items()[0], np.random.default_rng(0))
-    odd = read_depth_video(kinect_recording(tmp_path / "odd.mkv", depth[:, ::8, ::8], KINECT[:4]))
+    odd = read_depth_video(kinect_recording(tmp_path / "odd.mkv", depth, KINECT[:4]))
     assert odd.camera is None and "attached calibration is not used" in "".join(odd.notes)
+
+
+def test_pixels_that_no_ray_reaches_through_a_lens_are_dropped_and_counted(tmp_path):
+    """Its radius r (1 - r^2 / 2) grows up to 0.5443 of the focal length; OpenCV sends what lies beyond anywhere."""
+    np.save(tmp_path / "v.npy", depth := np.full((1, 48, 64), 1500, np.uint16))
+    reader = DepthVideos(inputs=(tmp_path / "v.npy",), intrinsics=LensIntrinsics(20, 20, 31.5, 23.5, (-0.5, 0, 0, 0)))
+    read = reader.read(reader.items()[0], np.random.default_rng(0))
+    inside = np.hypot(*np.meshgrid((np.arange(64) - 31.5) / 20, (np.arange(48) - 23.5) / 20)) < 0.5443
+    assert len(read.sequence.points) == inside.sum() and read.notes[BLIND] == depth.size - inside.sum()
+    assert np.hypot(*read.sequence.points.T[:2]).max() < 1.5 * np.sqrt(2 / 3)
 
 
 def test_two_streams_that_may_both_be_depth_are_listed(tmp_path):

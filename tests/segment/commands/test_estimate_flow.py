@@ -222,8 +222,8 @@ def test_a_trained_estimator_is_loaded_once_and_sees_the_drawn_points(data, tmp_
     model = FlowStep3D(FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbors=6, iterations=2))
     torch.nn.init.normal_(model.last.weight, std=0.1)
     model_file.save_flow_model(tmp_path / "best.safetensors", model, {})
-    loads, load = [], model_file.load_weights
-    monkeypatch.setattr(model_file, "load_weights", lambda *words: loads.append(1) or load(*words))
+    loads, load = [], model_file.load_network
+    monkeypatch.setattr(model_file, "load_network", lambda *words: loads.append(1) or load(*words))
     estimate(data, tmp_path / "flow.h5", flow=str(tmp_path))
     assert len(loads) == 1
     with CloudsReader(tmp_path / "flow.h5") as reader, CloudsReader(data) as before:
