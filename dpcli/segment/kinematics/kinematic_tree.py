@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from dpcli.segment.kinematics.joint_fit import JointFit, fit_joint
 from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajectories, points_at_start
-from dpcli.segment.kinematics.registration import Registration, register, relative_registration
+from dpcli.segment.kinematics.registration import Registration, register, register_tracks, relative_registration
 from dpcli.segment.kinematics.surface_directions import surface_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
@@ -19,6 +19,7 @@ _SURE = 0.05  # of the distance between neighboring points: no motion is known b
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
 _NEAREST = 3  # parts to which a part may be joined, besides what connects all
 _LARGE = 2.0  # nats by which the largest part is preferred as parent
+_HOLD = 4  # tracks that tell a motion and its noise
 _UNSEEN = 0.25  # of a part's size: a motion that is told where points don't show it
 
 
@@ -94,8 +95,13 @@ def _registrations(sequence: CloudSequence, trajectories: Trajectories, spacing:
     rng, known = np.random.default_rng(0), []
     frames = np.split(np.arange(len(sequence.points)), sequence.frame_offsets[1:-1])
     for k, part in enumerate(trajectories.ids):
-        clouds = [sequence.points[rows[sequence.part[rows] == part]].astype(np.float64) for rows in frames]
-        one = register(clouds, trajectories.motion[:, k], rng)
+        own = [rows[sequence.part[rows] == part] for rows in frames]
+        clouds, motion = [sequence.points[rows].astype(np.float64) for rows in own], trajectories.motion[:, k]
+        tracks = None if sequence.track is None else [sequence.track[rows] for rows in own]
+        if tracks is not None and len(np.unique(np.concatenate(tracks))) >= _HOLD:
+            known.append(register_tracks(clouds, tracks, motion))
+            continue
+        one = register(clouds, motion, rng)
         off = max(float(trajectories.disagreement[k]), _SURE * spacing)
         noise = np.diag(np.repeat([(off / max(one.size, 1e-9)) ** 2, off**2], 3))
         known.append(replace(one, covariance=one.covariance + noise))
@@ -103,12 +109,16 @@ def _registrations(sequence: CloudSequence, trajectories: Trajectories, spacing:
 
 
 def _relative_joint(parent: Registration, child: Registration, both: np.ndarray, directions: np.ndarray) -> JointFit:
-    """Returns the joint that explains the child's motion as the parent sees it, in the frames (mask) that show both."""
+    """Returns the joint that explains the child's motion as the parent sees it, in the frames (mask) that show both.
+
+    A frame that doesn't costs as much as one of a free joint, or what is never seen would be the cheapest parent.
+    """
     both = both.copy()
     both[0] = True
     fit = fit_joint(relative_registration(parent, child).of_frames(both), directions)
     value = np.interp(np.arange(len(both)), np.flatnonzero(both), fit.value)
-    return replace(fit, value=value)
+    unseen = 6 * (~both).sum() * np.log(max(6 * (len(both) - 1), 2))
+    return replace(fit, value=value, length=fit.length + float(unseen))
 
 
 def _gap(first: np.ndarray, second: np.ndarray) -> float:

@@ -9,11 +9,13 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.ops.rotations import nearest_rotation
+from dpcli.segment.multibody.tracks import fit_motions
 from dpcli.segment.rigid_motions import bring_to_rest, move
 from dpcli.segment.thinning import thin_evenly
 from dpcli.store import CloudSequence, PartsSample
 
 _ROUNDS = 20  # of averaging; it settles in a few
+_FITS = 3  # of the motions to the tracks' mean places; these change little by then
 _LEAST = 3  # points that a part needs in a frame for its motion to mean something
 
 
@@ -37,7 +39,8 @@ def part_trajectories(sequence: CloudSequence, said: PartsSample) -> Trajectorie
     """Returns one motion from frame 0 for each part and frame that fits the motions of all pairs, both ways.
 
     Motions are averaged over the pairs that lead to a frame, again and again (chordal means, projected to rotations), from
-    a start along the fewest pairs. Raises DataError for several parts in a single frame, and where a frame is reached by no pair.
+    a start along the fewest pairs. Points with an identity tell each frame's motion without those of pairs, whose errors add
+    up. Raises DataError for several parts in a single frame, and where a frame is reached by no pair.
     """
     ids = np.unique(sequence.part[sequence.part >= 0])
     if sequence.num_frames < 2 and len(ids) > 1:
@@ -49,6 +52,8 @@ def part_trajectories(sequence: CloudSequence, said: PartsSample) -> Trajectorie
     seen = counts >= _LEAST
     for _ in range(_ROUNDS if len(edges) > 2 * (sequence.num_frames - 1) else 0):
         motion = _averaged(motion, edges, seen)
+    if sequence.track is not None:
+        motion = np.stack([_by_tracks(sequence, int(part), motion[:, k]) for k, part in enumerate(ids)], 1)
     return Trajectories(ids, motion, seen, _disagreement(sequence, ids, motion, edges, seen))
 
 
@@ -87,6 +92,24 @@ def _averaged(motion: np.ndarray, edges: list, seen: np.ndarray) -> np.ndarray:
     mean[0] = np.eye(4)
     mean[..., :3, :3] = nearest_rotation(mean[..., :3, :3])
     return mean
+
+
+def _by_tracks(sequence: CloudSequence, part: int, motion: np.ndarray) -> np.ndarray:
+    """Returns the motions (T,4,4) that take a part's tracks, at their mean places, nearest to where each frame has them.
+
+    motion: where it starts, which stays in frames of too few tracks.
+    """
+    clouds, own = _frames_of(sequence.points, sequence), _frames_of(sequence.part == part, sequence)
+    clouds = [cloud[inside].astype(np.float64) for cloud, inside in zip(clouds, own, strict=True)]
+    _, row, count = np.unique(sequence.track[sequence.part == part], return_inverse=True, return_counts=True)
+    rows, motion = np.split(row, np.cumsum([len(cloud) for cloud in clouds])[:-1]), motion.copy()
+    for _ in range(_FITS):
+        back = np.concatenate([bring_to_rest(cloud, m) for cloud, m in zip(clouds, motion)])
+        mean = np.stack([np.bincount(row, axis) for axis in back.T], 1) / count[:, None]
+        for t, (cloud, at) in enumerate(zip(clouds, rows)):
+            if len(cloud) > _LEAST:
+                motion[t, :3] = fit_motions(mean[at][None], cloud[None])[0]
+    return motion @ np.linalg.inv(motion[0])
 
 
 def _disagreement(

@@ -17,6 +17,7 @@ _MOST = 256  # points of a part in a frame, and twice as many of all other frame
 _FEWEST = 9  # points that make a surface
 _STEPS = 8  # of ICP
 _SURE = 1e-3  # of the part's size: nothing is known better
+_EXACT = 1e-4  # the same of points with an identity
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,30 @@ def register(clouds: list[np.ndarray], motion: np.ndarray, rng: np.random.Genera
     covariance = spread * lengths[:, None] * lengths
     nearest = np.abs(np.arange(len(unit))[:, None] - chosen).argmin(1)
     return Registration(motion, center, size, covariance[nearest])
+
+
+def register_tracks(clouds: list[np.ndarray], tracks: list[np.ndarray], motion: np.ndarray) -> Registration:
+    """Returns the motions with their covariances where points have an identity, tracks i64 (n_t): those of least squares.
+
+    How far tracks lie from their mean places, at rest, is the noise. What points on a line don't tell, the turn about it, is
+    as unknown as by `register`.
+    """
+    back = [bring_to_rest(cloud, m) for cloud, m in zip(clouds, motion)]
+    joined = np.concatenate(back)
+    center, size = joined.mean(0), max(float(np.sqrt(joined.var(0).sum())), 1e-9)
+    _, row, count = np.unique(np.concatenate(tracks), return_inverse=True, return_counts=True)
+    unit = (joined - center) / (2 * size)
+    mean = np.stack([np.bincount(row, axis) for axis in unit.T], 1) / count[:, None]
+    free = 3 * (len(unit) - len(mean)) - 6 * len(clouds)  # numbers that neither places nor motions have used up
+    noise = ((unit - mean[row]) ** 2).sum() / max(free, 1)
+    x, y, z = mean[row].T
+    none, one = np.zeros_like(x), np.ones_like(x)
+    shifts = np.stack([none, z, -y, one, none, none, -z, none, x, none, one, none, y, -x, none, none, none, one], -1)
+    slopes = np.split(shifts.reshape(-1, 3, 6), np.cumsum([len(cloud) for cloud in clouds])[:-1])
+    told = np.stack([np.einsum("nij,nik->jk", slope, slope) for slope in slopes]) / max(noise, _EXACT**2)
+    lengths = np.repeat([1.0, 2 * size], 3)
+    covariance = np.linalg.inv(told + np.eye(6)) + _EXACT**2 * np.eye(6)
+    return Registration(motion, center, size, covariance * lengths[:, None] * lengths)
 
 
 def _spread(own: np.ndarray, others: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:

@@ -26,7 +26,12 @@ _STEPS, _STEPS_ALONG, _WIDE = 10, 6, 1.5  # of a fit, of one along a direction, 
 
 
 def with_point_axes(sequence: CloudSequence, tree: KinematicTree) -> KinematicTree:
-    """Returns the tree with the axes of hinges and slides that the points of both parts say (`SeenParts.with_axis`)."""
+    """Returns the tree with the axes of hinges and slides that the points of both parts say (`SeenParts.with_axis`).
+
+    Points with an identity have told their motions already, more exactly than the surfaces on which they lie.
+    """
+    if sequence.track is not None:
+        return tree
     seen, joints = SeenParts(sequence, tree.trajectories), []
     directions = [directions_and_edges(cloud) for cloud in tree.points]
     for joint in tree.joints:

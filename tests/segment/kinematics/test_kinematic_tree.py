@@ -289,3 +289,47 @@ def test_directions_of_a_dense_part_are_those_of_a_thin_one_and_need_no_memory_b
         assert np.abs(dense @ axis).max() > np.cos(np.radians(0.5)) and np.abs(thin @ axis).max() > np.cos(
             np.radians(2)
         )
+
+
+def _markers(poses, places, noise, rng):
+    """A sequence of markers with identities, places (n,3) for each part; motions of pairs by SciPy's fit to the noisy markers."""
+    from scipy.spatial.transform import Rotation
+
+    ids = np.repeat(np.arange(len(places)), [len(own) for own in places]).astype(np.int16)
+    frames = [np.concatenate([move(m, own) for own, m in zip(places, pose, strict=True)]) for pose in poses]
+    frames = [frame + rng.normal(size=frame.shape) * noise for frame in frames]
+    motion = np.tile(np.eye(4), (len(frames) - 1, len(places), 1, 1))
+    for t, k in np.ndindex(motion.shape[:2]):
+        before, after = frames[t][ids == k], frames[t + 1][ids == k]
+        turn = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))[0].as_matrix()
+        motion[t, k, :3, :3], motion[t, k, :3, 3] = turn, after.mean(0) - turn @ before.mean(0)
+    tracks = [np.arange(len(ids))] * len(frames)
+    sequence = CloudSequence.from_frames(
+        "markers", [np.float32(f) for f in frames], part=[ids] * len(frames), track=tracks
+    )
+    pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
+    return sequence, PartsSample(np.zeros((len(sequence.points), len(places))), pairs, np.float32(motion), [])
+
+
+@pytest.mark.parametrize("kind", [REVOLUTE, PRISMATIC])
+def test_few_markers_tell_a_joint_by_their_identities(kind):
+    """Five markers are no surface: without their identities the blades of scissors were one fixed thing."""
+    rng = np.random.default_rng(0)
+    places = [rng.uniform(-1, 1, (5, 3)) * [150, 30, 20] for _ in range(2)]
+    axis = np.array([0.6, 0, 0.8])
+    one = (lambda t: about(axis, t)) if kind == REVOLUTE else (lambda t: along(axis, 60 * t))
+    poses = [(about([0, 0, 1], 0.1 * t), about([0, 0, 1], 0.1 * t) @ one(0.08 * t)) for t in range(12)]
+    tree = kinematic_tree(*_markers(poses, places, 0.3, rng))
+    fit, turned = tree.joints[0].fit, 1 if tree.joints[0].child == 1 else -1
+    assert fit.kind == kind and abs(fit.axis @ axis) > np.cos(np.radians(3))
+    true = 0.08 * np.arange(12) * (1 if kind == REVOLUTE else 60) * turned * np.sign(fit.axis @ axis)
+    assert np.allclose(fit.value, true, atol=0.02 if kind == REVOLUTE else 1.0)
+
+
+def test_what_is_hardly_seen_is_no_parent():
+    """Nothing contradicts a joint on a part that only frame 0 shows, so it cost nothing."""
+    poses = [(np.eye(4), about([0, 0, 1], 0.2 * t, (0.5, 0, 0)), np.eye(4)) for t in range(6)]
+    sequence, said = made(poses, [((0, 0, 0), (1, 1, 1)), ((1, 0, 0), (1, 1, 0.1)), ((0.5, 0, 0.1), (0.1, 0.1, 0.1))])
+    sequence.part[sequence.frame_offsets[1] :][sequence.part[sequence.frame_offsets[1] :] == 2] = 0
+    tree = kinematic_tree(sequence, said)
+    assert {(joint.child, joint.parent) for joint in tree.joints if joint.fit.kind == REVOLUTE} in ({(1, 0)}, {(0, 1)})
