@@ -3,6 +3,8 @@ training videos; never the test ones."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dpcli.classify.network.config import CROSS
@@ -11,6 +13,8 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
+
+_FREQUENT = 0.5  # of the videos, from which on one class may hide how the others do
 
 
 def labeled(reader: CloudsReader, split: str) -> list[int]:
@@ -192,6 +196,20 @@ def about_absent_classes(reader: CloudsReader, training: list[int], validation: 
     return (
         f"none of them is of {len(absent)} of the {len(learned)} classes that were learned: {first_names(absent)}; how well these are"
         " recognized is unknown"
+    )
+
+
+def about_frequent_class(reader: CloudsReader, judged: Sequence[int]) -> str:
+    """Returns how many judged videos are right for whoever always names their most frequent class, for the user, "" where classes
+    are about equal."""
+    labels, counts = np.unique(reader.labels[list(judged)], return_counts=True)
+    most = int(counts.max(initial=0))
+    if not len(counts) or most < len(judged) * max(_FREQUENT, 1.5 / len(counts)):
+        return ""
+    name = class_table(reader)[labels[counts.argmax()]]
+    return (
+        f"{most} of these videos are of class {name}, so always naming it has {100 * most / len(judged):.1f} % right (the mean over"
+        " classes: `dpc evaluate classification`, balanced accuracy)"
     )
 
 
