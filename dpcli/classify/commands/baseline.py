@@ -11,7 +11,7 @@ from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.descriptors import descriptors
 from dpcli.classify.data.likeness import tell_mixed_sizes
-from dpcli.classify.data.validation_split import about_frequent_class, about_other_splits, class_table
+from dpcli.classify.data.validation_split import about_frequent_class, about_other_splits, class_table, unknown_people
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
@@ -161,7 +161,7 @@ def _forest_scores(
 def _seen(reader: CloudsReader, known: np.ndarray, rounds: list[tuple[np.ndarray, np.ndarray]]) -> str:
     people = reader.subjects[known]
     if people.min() < 0:
-        return "of people whom it may know: the file doesn't say who is seen"
+        return f"of people whom it may know: {unknown_people(reader, known)}"
     shared = [set(people[learned].tolist()) & set(people[judged].tolist()) for learned, judged in rounds]
     return (
         "of people whom it also learned from: people never seen come out lower" if any(shared) else "of unseen people"

@@ -231,16 +231,23 @@ def about_people(reader: CloudsReader, training: list[int], validation: list[int
     learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))
     if not judged:
         return ""
-    if training is validation and min(judged) >= 0 and len(judged) > 1:
-        return ""  # each by networks that saw other people
     if min(learned | judged) < 0:
         return (
-            "the file doesn't say who is seen; if the same people train and validate, people never seen come out lower"
-            " (a column subject in --labels holds whole people out)"
+            f"{unknown_people(reader, [*training, *validation])}; if the same people train and validate, people never seen come out"
+            " lower (a column subject in --labels holds whole people out)"
         )
+    if training is validation and len(judged) > 1:
+        return ""  # each by networks that saw other people
     shared = len(learned & judged)
     who = f"{shared} {'person trains and validates' if shared == 1 else 'people train and validate'}"
     return f"{who}: people never seen come out lower (--validation subject holds whole people out)" if shared else ""
+
+
+def unknown_people(reader: CloudsReader, videos: Sequence[int]) -> str:
+    """Returns in how many of these videos, of which it is unknown in one at least, the file doesn't say who is seen."""
+    own = np.unique(videos)
+    unknown = int((reader.subjects[own] < 0).sum())
+    return "the file doesn't say who is seen" + (f" in {unknown} of {len(own)} videos" if unknown < len(own) else "")
 
 
 def about_tested_people(reader: CloudsReader, training: list[int], tests: list[int]) -> str:

@@ -303,7 +303,7 @@ def test_validation_comes_from_training_subjects_only(reader):
         ((0, 1, 2, 3), ""),
         ((0, 1, 1, 0), "2 people train and validate: people never seen come out lower"),
         ((0, 1, 2, 1), "1 person trains and validates"),
-        ((0, 1, -1, 1), "the file doesn't say who is seen"),
+        ((0, 1, -1, 1), "the file doesn't say who is seen in 1 of 4 videos;"),
     ],
 )
 def test_people_who_train_and_validate_are_told(tmp_path, make_sequence, subjects, told):
