@@ -11,7 +11,7 @@ from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.copies import tell_copies
 from dpcli.classify.data.descriptors import descriptors
 from dpcli.classify.data.likeness import tell_mixed_sizes
-from dpcli.classify.data.validation_split import about_other_splits, class_table
+from dpcli.classify.data.validation_split import about_frequent_class, about_other_splits, class_table, unknown_people
 from dpcli.counted import counted
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
@@ -31,7 +31,7 @@ _STEADY = 3  # videos a class at least, so that each fold has some to learn from
 class Baseline:
     """Says how a forest did: videos it learned from and judged, how many of these it got right, and who they were.
 
-    seen: what the judged videos share with those of the training, in words for a person.
+    seen: what the judged videos share with those of the training, and one class that most of them show, in words for a person.
     """
 
     learned: int
@@ -81,7 +81,8 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
             _write(reader, known[judged], scores[judged], output, seed, force)
         right = int((scores[judged].argmax(1) == labels[judged]).sum())
         learned = sum(len(one) for one, _ in rounds) // len(rounds)
-        return Baseline(learned, len(judged), right, len(set(labels.tolist())), _seen(reader, known, rounds))
+        seen = "; ".join(filter(None, (_seen(reader, known, rounds), about_frequent_class(reader, known[judged]))))
+        return Baseline(learned, len(judged), right, len(set(labels.tolist())), seen)
 
 
 def forest_accuracy(reader: CloudsReader, learned: list[int], judged: list[int], seed: int) -> float:
@@ -160,7 +161,7 @@ def _forest_scores(
 def _seen(reader: CloudsReader, known: np.ndarray, rounds: list[tuple[np.ndarray, np.ndarray]]) -> str:
     people = reader.subjects[known]
     if people.min() < 0:
-        return "of people whom it may know: the file doesn't say who is seen"
+        return f"of people whom it may know: {unknown_people(reader, known)}"
     shared = [set(people[learned].tolist()) & set(people[judged].tolist()) for learned, judged in rounds]
     return (
         "of people whom it also learned from: people never seen come out lower" if any(shared) else "of unseen people"

@@ -29,6 +29,7 @@ from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     about_absent_classes,
     about_classes,
+    about_frequent_class,
     about_other_splits,
     about_people,
     about_tested_people,
@@ -292,6 +293,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     remarks = (
         about_classes(reader, folds),
         about_absent_classes(reader, training, validation),
+        about_frequent_class(reader, validation),
         about_people(reader, training, validation),
     )
     caveat = "; ".join(filter(None, remarks))

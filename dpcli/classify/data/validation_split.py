@@ -3,6 +3,8 @@ training videos; never the test ones."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dpcli.classify.network.config import CROSS
@@ -11,6 +13,8 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
+
+_FREQUENT = 0.5  # of the videos, from which on one class may hide how the others do
 
 
 def labeled(reader: CloudsReader, split: str) -> list[int]:
@@ -195,6 +199,20 @@ def about_absent_classes(reader: CloudsReader, training: list[int], validation: 
     )
 
 
+def about_frequent_class(reader: CloudsReader, judged: Sequence[int]) -> str:
+    """Returns how many judged videos are right for whoever always names their most frequent class, for the user, "" where classes
+    are about equal."""
+    labels, counts = np.unique(reader.labels[list(judged)], return_counts=True)
+    most = int(counts.max(initial=0))
+    if not len(counts) or most < len(judged) * max(_FREQUENT, 1.5 / len(counts)):
+        return ""
+    name = class_table(reader)[labels[counts.argmax()]]
+    return (
+        f"{most} of these videos are of class {name}, so always naming it has {100 * most / len(judged):.1f} % right (the mean over"
+        " classes: `dpc evaluate classification`, balanced accuracy)"
+    )
+
+
 def about_other_splits(reader: CloudsReader) -> str:
     """Returns which videos neither train nor judge, as they are of no split or of one that isn't known, "" where there are none."""
     others: dict[str, list[str]] = {}
@@ -213,16 +231,23 @@ def about_people(reader: CloudsReader, training: list[int], validation: list[int
     learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))
     if not judged:
         return ""
-    if training is validation and min(judged) >= 0 and len(judged) > 1:
-        return ""  # each by networks that saw other people
     if min(learned | judged) < 0:
         return (
-            "the file doesn't say who is seen; if the same people train and validate, people never seen come out lower"
-            " (a column subject in --labels holds whole people out)"
+            f"{unknown_people(reader, [*training, *validation])}; if the same people train and validate, people never seen come out"
+            " lower (a column subject in --labels holds whole people out)"
         )
+    if training is validation and len(judged) > 1:
+        return ""  # each by networks that saw other people
     shared = len(learned & judged)
     who = f"{shared} {'person trains and validates' if shared == 1 else 'people train and validate'}"
     return f"{who}: people never seen come out lower (--validation subject holds whole people out)" if shared else ""
+
+
+def unknown_people(reader: CloudsReader, videos: Sequence[int]) -> str:
+    """Returns in how many of these videos, of which it is unknown in one at least, the file doesn't say who is seen."""
+    own = np.unique(videos)
+    unknown = int((reader.subjects[own] < 0).sum())
+    return "the file doesn't say who is seen" + (f" in {unknown} of {len(own)} videos" if unknown < len(own) else "")
 
 
 def about_tested_people(reader: CloudsReader, training: list[int], tests: list[int]) -> str:

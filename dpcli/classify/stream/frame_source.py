@@ -112,6 +112,8 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[
         if magic[:6] != _MAGIC[: len(magic)]:
             raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
         shape, fortran, dtype = _header(source, magic, where)
+        if 0 in shape:  # as of an empty list, [] or [[]], whatever the number of columns
+            shape = (0, 3 + len(columns))
         if columns and shape[1] != 3 + len(columns):
             raise DataError(
                 f"{where}: {shape[1]} numbers a point; the model reads {3 + len(columns)}: x, y, z, {', '.join(columns)}, in this"
@@ -147,6 +149,8 @@ def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], 
     except ValueError as error:
         _check_whole(source, where)
         raise DataError(f"{where}: damaged .npy header ({error}); {_RECIPE}") from None
+    if dtype.kind in "uif" and 0 in shape:
+        return shape, fortran, dtype
     if len(shape) != 2 or shape[1] < 3 or dtype.kind not in "uif":
         raise DataError(f"{where}: array of shape {shape}, {dtype}, not one frame's (points, 3); {_RECIPE}")
     if shape[0] == 3 and shape[1] > _MOST_NUMBERS:

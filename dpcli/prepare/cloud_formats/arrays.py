@@ -152,7 +152,7 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         return cloud
     if keep:
         raise DataError(f"{path}: column {keep[0]}: its columns have no names")
-    if array.shape == (0,):  # of an empty list of points
+    if array.size == 0:  # of an empty list of points, [] or [[]]
         return Cloud(np.zeros((0, 3), np.float32))
     if array.ndim == 3 and array.shape[0] == 1:  # a batch of one
         array = array[0]

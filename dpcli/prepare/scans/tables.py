@@ -47,6 +47,11 @@ PIECES = (
     "{0} are called like pieces of one table; each is read as sequences of its own. If they are pieces, join them, such as by"
     " pandas.read_parquet(FOLDER).to_parquet(FILE)"
 )
+_LABELS = re.compile(r"action|activity|gesture", re.IGNORECASE)  # in a column's name; a label may be that of a point
+LABELED = (
+    "labels are not read from column {0!r}; where it tells what a sequence shows, give --labels a table name,label with a row for"
+    " each sequence, whose names are like {1}"
+)
 _FEW = 5  # frames of one point that may be true
 _OTHER_RATE = 0.05  # of a rate that was given, from which the times of a column differ by as much
 
@@ -176,6 +181,8 @@ class TableSequences(OwnScans):
                 lines.append(
                     f"--fps {self.fps:g} is not used: column {loaded.column!r} tells the times, {rate:.3g} frames a second"
                 )
+            labels = [] if self._table.rows else list(filter(_LABELS.search, loaded.unused))
+            lines += [LABELED.format(labels[0], good.name)] if labels else []
         pieces = [name for name in self._paths if _PIECE.fullmatch(name)]
         lines += [PIECES.format(first_names(pieces, 2))] if len(pieces) > 1 else []
         read = {path.suffix.lower() for path in self._paths.values()}

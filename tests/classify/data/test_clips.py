@@ -24,6 +24,7 @@ from dpcli.classify.data.clips import (
 )
 from dpcli.classify.data.validation_split import (
     about_absent_classes,
+    about_frequent_class,
     about_people,
     about_tested_people,
     carve_validation,
@@ -302,7 +303,7 @@ def test_validation_comes_from_training_subjects_only(reader):
         ((0, 1, 2, 3), ""),
         ((0, 1, 1, 0), "2 people train and validate: people never seen come out lower"),
         ((0, 1, 2, 1), "1 person trains and validates"),
-        ((0, 1, -1, 1), "the file doesn't say who is seen"),
+        ((0, 1, -1, 1), "the file doesn't say who is seen in 1 of 4 videos;"),
     ],
 )
 def test_people_who_train_and_validate_are_told(tmp_path, make_sequence, subjects, told):
@@ -347,6 +348,29 @@ def test_what_was_held_out_is_named_so_that_it_holds_for_other_files(tmp_path, m
         "none of them is of 1 of the 3 classes that were learned: c;"
     )
     assert about_absent_classes(reader, training, training) == about_absent_classes(reader, training, []) == ""
+
+
+@pytest.mark.parametrize(
+    ("counts", "share"),
+    [
+        ((8, 1, 1), "80.0"),
+        ((1, 3), "75.0"),
+        ((5, 5), ""),
+        ((7, 4), ""),
+        ((4, 3, 3), ""),
+        ((5, 3, 2), "50.0"),
+        ((9,), ""),
+    ],
+)
+def test_a_class_that_most_videos_show_is_told(tmp_path, make_sequence, counts, share):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b", "c"]) as writer:
+        for label, count in enumerate(counts):
+            for k in range(count):
+                writer.write(make_sequence(f"{label}/{k}", label=label, split="train"))
+    reader = CloudsReader(tmp_path / "own.h5")
+    said = about_frequent_class(reader, range(len(reader)))
+    assert about_frequent_class(reader, []) == "" and bool(said) is bool(share)
+    assert not share or f"{max(counts)} of these videos are of class" in said and f"has {share} % right" in said
 
 
 def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):

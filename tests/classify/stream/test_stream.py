@@ -275,6 +275,13 @@ def test_a_bad_frame_is_named(name):
         assert name == "HDF5" or f"frame {before}" in str(told.value)
 
 
+@pytest.mark.parametrize("nothing", [np.array([]), np.array([[]]), np.zeros((0, 5)), np.zeros((0, 3), np.int16)])
+def test_an_array_of_no_numbers_is_a_frame_without_points(nothing):
+    """As `np.array(points)` of an empty list, which a radar's program sends while nobody moves."""
+    found = through_a_pipe(npy(GOOD) + npy(nothing) + npy(GOOD))
+    assert [frame.shape for frame in found] == [(5, 3), (0, 3), (5, 3)]
+
+
 def test_columns_that_are_not_read_are_told_once(capsys):
     wide = np.random.default_rng(0).random((5, 4)).astype(np.float32)
     found = through_a_pipe(npy(wide) * 2)

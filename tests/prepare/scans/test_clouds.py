@@ -440,8 +440,9 @@ def test_millimeters_with_fractions_are_asked_for(tmp_path, at, size, told):
     assert any("millimeters" in note for note in notes) == told
 
 
-def test_an_empty_list_of_points_is_a_frame_without_points(tmp_path):
-    for t, points in enumerate((np.ones((4, 3)), np.zeros(0), np.ones((5, 3)))):
+@pytest.mark.parametrize("nothing", [[], [[]]])
+def test_an_empty_list_of_points_is_a_frame_without_points(nothing, tmp_path):
+    for t, points in enumerate((np.ones((4, 3)), np.array(nothing), np.ones((5, 3)))):
         np.save(tmp_path / f"{t}.npy", points + np.arange(points.size).reshape(points.shape))
     reader = CloudFolders(tmp_path, fps=10)
     sample = reader.read(reader.items()[0], np.random.default_rng(0))

@@ -162,6 +162,18 @@ def test_labels_of_tables(tmp_path):
     assert [(i.name, i.label, i.subject, i.split) for i in items][0] == ("run/a", 3, 7, "test")
 
 
+@pytest.mark.parametrize(("column", "told"), [("activity", True), ("Gesture_ID", True), ("label", False)])
+def test_a_column_that_may_tell_labels_is_named(tmp_path, column, told):
+    rows = [(recording, *row, "wave") for recording in (3, 4) for row in frames(0, 1)]
+    path = write(tmp_path / "r.csv", rows, f"recording,frame,x,y,z,{column}")
+    reader = TableSequences(path, sequence_column="recording")
+    said = [line for line in reader.summary(reader.items()) if "labels are not read" in line]
+    assert [f"from column {column!r};" in line and line.endswith("like r/3") for line in said] == [True] * told
+    (tmp_path / "labels.csv").write_text("name,label\nr/3,wave\nr/4,wave\n")
+    labeled = TableSequences(path, sequence_column="recording", labels=tmp_path / "labels.csv")
+    assert not any("labels are not read" in line for line in labeled.summary(labeled.items()))
+
+
 def test_a_bad_table_is_skipped_and_named(tmp_path):
     write(tmp_path / "in" / "a.csv", frames(0, 1))
     write(tmp_path / "in" / "b.csv", [("0", 1, 2, "word")])

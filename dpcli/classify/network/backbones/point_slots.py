@@ -83,7 +83,10 @@ class PointSlots(Backbone):
 
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Raises UsageError: there are no neighborhoods to look at."""
-        raise UsageError("the backbone slots has no neighborhoods and no dynamic stream; only its scores can be used")
+        raise UsageError(
+            "a network for sparse clouds (backbone slots) has no neighborhoods and no dynamic stream, so it predicts but can't be"
+            " explained; `dpc classify train --preset quick` trains one that can"
+        )
 
 
 class _Member(nn.Module):
