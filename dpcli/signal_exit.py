@@ -166,8 +166,9 @@ def shows_impatience(number: int) -> bool:
     """Returns whether a signal that follows another one asks to end at once.
 
     SIGHUP doesn't: where a terminal closes, its shell and the system send one each, and a login that ends adds one to SIGTERM.
+    No signal does below torchrun, which passes on what a batch system has sent to every process, and kills after 30 seconds.
     """
-    return signal.Signals(number).name != "SIGHUP"
+    return signal.Signals(number).name != "SIGHUP" and "TORCHELASTIC_RUN_ID" not in os.environ
 
 
 def let_end() -> None:

@@ -125,7 +125,7 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
     from safetensors.torch import load
 
     with reading(path):
-        try:  # not the library's own opening: it maps the file, which not every network file system allows
+        try:  # not the library's own opening: it takes no path that isn't UTF-8, and in older versions shares maps
             content = path.read_bytes()
             tensors = load(content)
             header = _header(content).get("__metadata__") or {}

@@ -15,11 +15,13 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
 import pytest
 
+from dpcli.interpreter import settle_interpreter
 from dpcli.segment.training.flow_store import FlowStore
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.file import read_skipped, write_skipped
@@ -431,6 +433,15 @@ def test_a_current_folder_that_was_removed_is_said(named, tmp_path, words):
     done = shell(f"cd {tmp_path}; mkdir gone; cd gone; rmdir ../gone; DPC {words}", named)
     assert done.returncode == 3 and done.stderr.startswith("dpc: error: the current folder was removed; "), done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_who_has_no_home_gets_no_folder_called_like_it(monkeypatch):
+    """A container's user without HOME and without an entry among the system's: numba kept its cache in ./~"""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", Mock(side_effect=KeyError))
+    settle_interpreter()
+    assert os.path.expanduser("~/.cache") == "/dev/null/.cache"
 
 
 def test_what_a_terminal_can_not_show_is_spelled(named):

@@ -14,6 +14,8 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.signals import stop_requested
+from dpcli.signal_exit import shows_impatience
 from dpcli.store import ScoresWriter
 from tests.support.prepare_helpers import ROOT
 
@@ -292,6 +294,18 @@ def test_a_second_signal_ends_it_at_once(folder):
         process.terminate()
     _, told = process.communicate(timeout=120)
     assert process.returncode == 75 and told == b"dpc: error: stopped by SIGTERM; run the same command again\n"
+
+
+def test_what_torchrun_passes_on_is_no_second_signal(monkeypatch):
+    """Slurm sends SIGTERM to every process of a step, and torchrun to its own again: they ended before anything was saved."""
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    assert shows_impatience(signal.SIGTERM)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setattr("dpcli.runtime.signals.os._exit", lambda code: pytest.fail(f"ended with {code}"))
+    with stop_requested() as stop:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert stop.name == "SIGTERM"
 
 
 def test_a_second_hangup_leaves_the_first_its_time_to_tidy_up():
