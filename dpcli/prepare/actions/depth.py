@@ -219,7 +219,11 @@ class DepthVideos(Reader):
         )
         notes |= {} if self.invert or np.isfinite(self.far) else doubts_of_marks(depth)
         depth, unit = self._inverted(depth, item.path), 1 / scale
-        notes |= {MISSING: video.missing, CUT: int(video.ends_early and not video.missing), BLIND: count_blind(depth, camera)}
+        notes |= {
+            MISSING: video.missing,
+            CUT: int(video.ends_early and not video.missing),
+            BLIND: count_blind(depth, camera),
+        }
         seen = depth
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
