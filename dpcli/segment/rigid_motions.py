@@ -1,8 +1,10 @@
-"""Rigid motions as matrices of a rotation and a shift, (...,3,4) or (...,4,4): points moved, motions composed and compared."""
+"""Rigid motions as matrices of a rotation and a shift, (...,3,4) or (...,4,4): moved by, fitted, composed and compared."""
 
 from __future__ import annotations
 
 import numpy as np
+
+HOLD = 4  # common points that can hold a motion
 
 
 def move(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -40,3 +42,19 @@ def motion_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Returns the motions (...,3,4) that lead from where motions `first` take a body to where `second` do, (...,3,4) each."""
     turn = second[..., :3] @ np.swapaxes(first[..., :3], -1, -2)
     return np.concatenate([turn, second[..., 3:] - turn @ first[..., 3:]], -1)
+
+
+def fit_motions(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Returns the rigid motions (B,3,4) that take source (B,n,3) nearest to target (B,n,3), in the least squares.
+
+    weights: f (B,n), of points. Fewer than four points, which hold no turn surely, are shifted.
+    """
+    weights = np.ones(source.shape[:2]) if weights is None else weights
+    weights = (weights / weights.sum(1, keepdims=True))[..., None]
+    a, b = (weights * source).sum(1), (weights * target).sum(1)
+    rotation = np.tile(np.eye(3), (len(source), 1, 1))
+    if source.shape[1] >= HOLD:
+        left, _, right = np.linalg.svd(np.swapaxes(target - b[:, None], 1, 2) @ (weights * (source - a[:, None])))
+        left[:, :, 2] *= np.where(np.linalg.det(left @ right) < 0, -1, 1)[:, None]
+        rotation = left @ right
+    return np.concatenate([rotation, (b - (rotation @ a[..., None])[..., 0])[..., None]], 2)

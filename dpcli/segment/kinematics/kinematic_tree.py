@@ -12,6 +12,7 @@ from dpcli.segment.kinematics.joint_fit import JointFit, fit_joint
 from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajectories, points_at_start
 from dpcli.segment.kinematics.registration import Registration, register, register_tracks, relative_registration
 from dpcli.segment.kinematics.surface_directions import surface_directions
+from dpcli.segment.rigid_motions import HOLD
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
@@ -19,7 +20,6 @@ _SURE = 0.05  # of the distance between neighboring points: no motion is known b
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
 _NEAREST = 3  # parts to which a part may be joined, besides what connects all
 _LARGE = 2.0  # nats by which the largest part is preferred as parent
-_HOLD = 4  # tracks that tell a motion and its noise
 _UNSEEN = 0.25  # of a part's size: a motion that is told where points don't show it
 
 
@@ -98,7 +98,7 @@ def _registrations(sequence: CloudSequence, trajectories: Trajectories, spacing:
         own = [rows[sequence.part[rows] == part] for rows in frames]
         clouds, motion = [sequence.points[rows].astype(np.float64) for rows in own], trajectories.motion[:, k]
         tracks = None if sequence.track is None else [sequence.track[rows] for rows in own]
-        if tracks is not None and len(np.unique(np.concatenate(tracks))) >= _HOLD:
+        if tracks is not None and len(np.unique(np.concatenate(tracks))) >= HOLD:
             known.append(register_tracks(clouds, tracks, motion))
             continue
         one = register(clouds, motion, rng)

@@ -9,8 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.ops.rotations import nearest_rotation
-from dpcli.segment.multibody.tracks import fit_motions
-from dpcli.segment.rigid_motions import bring_to_rest, move
+from dpcli.segment.rigid_motions import HOLD, bring_to_rest, fit_motions, move
 from dpcli.segment.thinning import thin_evenly
 from dpcli.store import CloudSequence, PartsSample
 
@@ -107,7 +106,7 @@ def _by_tracks(sequence: CloudSequence, part: int, motion: np.ndarray) -> np.nda
         back = np.concatenate([bring_to_rest(cloud, m) for cloud, m in zip(clouds, motion)])
         mean = np.stack([np.bincount(row, axis) for axis in back.T], 1) / count[:, None]
         for t, (cloud, at) in enumerate(zip(clouds, rows)):
-            if len(cloud) > _LEAST:
+            if len(cloud) >= HOLD:
                 motion[t, :3] = fit_motions(mean[at][None], cloud[None])[0]
     return motion @ np.linalg.inv(motion[0])
 

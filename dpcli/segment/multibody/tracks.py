@@ -8,11 +8,10 @@ import numpy as np
 
 from dpcli.ops.rigid_parts import find_parts
 from dpcli.segment.multibody.settings import MultibodySettings
-from dpcli.segment.rigid_motions import move_each
+from dpcli.segment.rigid_motions import HOLD, fit_motions, move_each
 
 _PATCHES = 300  # that are joined to parts; the smallest part is one of them
 _SOFT = 0.02  # the setting `flexible` at which parts bend as animals' skin does
-_FEWEST = 4  # common points that can hold a motion
 _AROUND = 8  # tracks that carry one that a frame doesn't show
 _GUESSED = 0.02  # weight of a place where no frame shows the track
 _ROUNDS, _OWN = 3, 0.7  # in which tracks choose their parts again; share of their own deviation beside their neighbors'
@@ -47,7 +46,7 @@ class Tracks:
         Tracks that one of both frames doesn't show don't count, unless too few are left to hold a motion.
         """
         places, both = self.places[frames][:, inside], self.shown[frames][:, inside] & self.shown[t, inside]
-        weights = np.where(both.sum(1, keepdims=True) >= _FEWEST, both, 1.0) * weights
+        weights = np.where(both.sum(1, keepdims=True) >= HOLD, both, 1.0) * weights
         return fit_motions(np.broadcast_to(self.places[t, inside], places.shape), places, weights)
 
 
@@ -117,7 +116,7 @@ def _places_in_parts(tracks: Tracks, part: np.ndarray, first: int, reach: float)
     several = {first, 0, len(tracks.places) // 2, len(tracks.places) - 1}  # in one of them a track may be elsewhere
     near, sizes = part[np.concatenate([_near(tracks, t) for t in sorted(several)], 1)], np.bincount(part)
     home, away, least = tracks.places.copy(), np.zeros(tracks.shown.shape), np.full(len(part), np.inf)
-    for k in np.flatnonzero(sizes >= _FEWEST):
+    for k in np.flatnonzero(sizes >= HOLD):
         inside, weights = np.flatnonzero(part == k), np.ones(sizes[k])
         for _ in range(_REFITS):
             motions = tracks.motions(inside, first, weights=weights)
@@ -147,22 +146,6 @@ def _most_frequent(places: np.ndarray, shown: np.ndarray, reach: float) -> tuple
         near = shown * (gaps < reach)
         rest[better] = ((near[..., None] * places).sum(0) / near.sum(0).clip(1)[:, None])[better]
     return rest, cost
-
-
-def fit_motions(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Returns the rigid motions (B,3,4) that take source (B,n,3) nearest to target (B,n,3), in the least squares.
-
-    weights: f (B,n), of points. Fewer than four points, which hold no turn surely, are shifted.
-    """
-    weights = np.ones(source.shape[:2]) if weights is None else weights
-    weights = (weights / weights.sum(1, keepdims=True))[..., None]
-    a, b = (weights * source).sum(1), (weights * target).sum(1)
-    rotation = np.tile(np.eye(3), (len(source), 1, 1))
-    if source.shape[1] >= _FEWEST:
-        left, _, right = np.linalg.svd(np.swapaxes(target - b[:, None], 1, 2) @ (weights * (source - a[:, None])))
-        left[:, :, 2] *= np.where(np.linalg.det(left @ right) < 0, -1, 1)[:, None]
-        rotation = left @ right
-    return np.concatenate([rotation, (b - (rotation @ a[..., None])[..., 0])[..., None]], 2)
 
 
 def parts_of_tracks(tracks: Tracks, settings: MultibodySettings) -> np.ndarray:

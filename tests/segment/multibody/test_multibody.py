@@ -16,10 +16,10 @@ from dpcli.segment.multibody.least_turn import turn_least
 from dpcli.segment.multibody.search import Search, explain_sequence
 from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
-from dpcli.segment.multibody.tracks import fit_motions, follow_tracks, parts_of_tracks
+from dpcli.segment.multibody.tracks import follow_tracks, parts_of_tracks
 from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import Refinement
-from dpcli.segment.rigid_motions import move
+from dpcli.segment.rigid_motions import fit_motions, move
 from dpcli.segment.training.trainer import rand_index
 from dpcli.store import CloudSequence
 
