@@ -9,6 +9,7 @@ import torch
 
 from dpcli.classify.data.clips import Clip, ClipSource
 from dpcli.classify.training.schedule import Schedule
+from dpcli.errors import first_line
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
 from dpcli.runtime.worker_server import choose_socket_folder
@@ -53,7 +54,7 @@ class EpochBatches:
     def load(self, epoch: int, first: int) -> Iterator[Batch]:
         """Yields this process's parts of an epoch's batches, from the batch `first` on.
 
-        Raises RuntimeError of torch when a process that loads clips ends.
+        Raises ChildProcessError when a process that loads clips was killed.
         """
         turn = epoch % self.draws if self.draws else epoch
         number = self.stage * DRAWS_PER_STAGE + turn
@@ -66,7 +67,12 @@ class EpochBatches:
         options = {"num_workers": workers, "multiprocessing_context": "forkserver"} if workers else {}
         if workers:
             choose_socket_folder()
-        yield from torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, mine), self.share, **options)
+        try:
+            yield from torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, mine), self.share, **options)
+        except Exception as error:
+            if not _tells_of_killed_worker(error):
+                raise
+            raise ChildProcessError(first_line(error)) from error
 
     def _draw(self, number: int) -> list[Clip]:
         return self.source.epoch(number, self.schedule.clips_per_video or None, self.schedule.video_loss)
@@ -78,3 +84,21 @@ class EpochBatches:
         together = self.schedule.clips_per_loss
         order = generator(self.source.seed, ClassifyStream.DRAW_ORDER, epoch).permutation(clips // together)
         return (order[:, None] * together + np.arange(together)).ravel().tolist()
+
+
+def _tells_of_killed_worker(error: Exception) -> bool:
+    """Returns whether a loader's error says that a worker was killed: in torch's words, or, before it knows, by a pipe that ended.
+
+    >>> _tells_of_killed_worker(RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "))
+    True
+    >>> _tells_of_killed_worker(EOFError()), _tells_of_killed_worker(ConnectionResetError(104, "Connection reset by peer"))
+    (True, True)
+
+    What the work itself raised in a worker comes with another sentence of torch before it.
+
+    >>> _tells_of_killed_worker(RuntimeError("Caught RuntimeError in DataLoader worker process 0."))
+    False
+    """
+    said = str(error)
+    pipe_ended = isinstance(error, (EOFError, ConnectionError)) and not said.startswith("Caught ")
+    return pipe_ended or "DataLoader worker (pid" in said

@@ -22,7 +22,7 @@ from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.optimizer_step import StageStep, watch_of
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.validation import validation_accuracy
-from dpcli.errors import DpcError, first_line
+from dpcli.errors import DpcError
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder, state_of, take_state
@@ -129,12 +129,10 @@ class Trainer:
         """Yields the epoch's batches from `self.step` on. Raises DpcError, once the work is saved, when a worker was killed."""
         try:
             yield from data.load(self.epoch, self.step)
-        except RuntimeError as error:
-            if "DataLoader worker" not in str(error):
-                raise
+        except ChildProcessError as error:
             self._save_state(together=False)
             raise DpcError(
-                f"a process that loads clips was killed, perhaps for lack of memory ({first_line(error)});"
+                f"a process that loads clips was killed, perhaps for lack of memory ({error});"
                 f" saved at epoch {self.epoch + 1}, step {self.step}: run again to continue, with fewer workers"
                 " (--set workers=0)"
             ) from None
