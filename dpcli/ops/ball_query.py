@@ -65,9 +65,18 @@ def balanced_shares(k: int, reach: int) -> list[int]:
     return [k * (i + 1) // frames - k * i // frames for i in range(frames)]
 
 
-def space_time_ball_query_reference(*arguments, order: str = "first") -> tuple[torch.Tensor, torch.Tensor]:
+def space_time_ball_query_reference(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    radii: torch.Tensor | Sequence[float],
+    k: int,
+    *,
+    order: str = "first",
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Computes `space_time_ball_query` in plain torch, as a reference: all pairs, in blocks of bounded memory."""
-    return _any_torch(_checked(*arguments, order))
+    return _any_torch(_checked(points, times, centroids, centroid_times, radii, k, order))
 
 
 class _Query(NamedTuple):
