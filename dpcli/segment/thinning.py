@@ -6,7 +6,7 @@ import numpy as np
 
 
 def spread_places(count: int, most: int) -> np.ndarray:
-    """Returns at most `most` of the numbers 0 to count - 1, i64, ascending and evenly spread.
+    """Returns at most `most` of the numbers 0 to count - 1, i64, ascending and evenly spread, rounded down.
 
     >>> spread_places(9, 3).tolist(), spread_places(2, 5).tolist(), spread_places(0, 4).tolist()
     ([0, 4, 8], [0, 1], [])

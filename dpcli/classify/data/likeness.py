@@ -123,7 +123,8 @@ def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
     """Returns `file_like` of the videos that a model learned from, as far as it is known."""
     own = info.notes.get(NOTE) or (_SHIPPED if find_model(model).parent == SHIPPED else {})
     numbers = own if isinstance(own, dict) else {}
-    if numbers and (SHIPPED / f"{model}.safetensors").is_file():  # its notes may be older than those of axes and places
+    file = SHIPPED / f"{model}.safetensors"  # elsewhere for the absolute path of another model
+    if numbers and file.parent == SHIPPED and file.is_file():  # its notes may be older than those of axes and places
         numbers = _SHIPPED | numbers
     return {key: value for key, value in numbers.items() if isinstance(value, int | float)}
 

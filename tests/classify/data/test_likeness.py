@@ -254,3 +254,14 @@ def test_the_first_seconds_of_a_stream_may_show_nobody_who_moves(speed, told, ca
     assert ("column v" in capsys.readouterr().err) == told
     tell_values("x", "v", np.zeros(0), ModelInfo(config, ["a"], "slots"), "runs/own")
     assert not capsys.readouterr().err
+
+
+def test_another_model_beside_a_file_of_its_name_is_no_shipped_one(tmp_path, capsys):
+    """A run folder `best` beside `best.safetensors`: where its videos stood is not known."""
+    (tmp_path / "best.safetensors").touch()
+    info = ModelInfo(KinetConfig(normalize="center"), ["a"], notes={NOTE: {"extent": 0.3, "points": 100.0}})
+    behind = {"extent": 0.3, "points": 100.0, "at_x": 0.0, "at_y": 0.0, "at_z": -2.0}
+    tell_unlike("x", behind, info, tmp_path / "best")
+    assert "from the origin" not in capsys.readouterr().err
+    tell_unlike("x", behind, info, "msraction3d-24")
+    assert "lies along -z from the origin" in capsys.readouterr().err
