@@ -84,8 +84,10 @@ demo: $(READY)
 	@echo "The 4D scene: open demo/scene.html in a browser, or demo/scene.mp4."
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png, demo/parts.gif and demo/scene.png."
 
+# What failed runs again, to show values: pytest's rewriting of all assertions takes each worker ten seconds.
+TESTS := $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 test: lint
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+	$(TESTS) --assert=plain || { $(TESTS) --last-failed --last-failed-no-failures none; exit 1; }
 
 # Chapter 3 and appendix A (docs/reproduce.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
 # PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video

@@ -15,7 +15,10 @@ def main() -> None:
     )
 
     watch_signals()
+    import gc
     import sys
+
+    gc.set_threshold(20_000)  # 700 objects, the default, come with each of the modules that libraries load
 
     try:
         from dpcli.interpreter import settle_interpreter
@@ -38,6 +41,7 @@ def main() -> None:
         sys.exit(code)
     finally:
         acknowledge_signal()
+        gc.freeze()  # else Python searches all that libraries made for garbage, twice, before it ends
 
 
 if __name__ == "__main__":

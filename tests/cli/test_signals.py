@@ -89,7 +89,7 @@ def what_it_said(process: subprocess.Popen) -> str:
         (command, number)
         for command in COMMANDS
         for number in CODES
-        if command == "profile" or number in (signal.SIGINT, signal.SIGTERM)
+        if command == "info" or number in (signal.SIGINT, signal.SIGTERM)
     ],
 )
 def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):

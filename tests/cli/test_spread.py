@@ -125,7 +125,7 @@ def test_a_worker_killed_in_the_middle_costs_only_time(folder, whole, tmp_path):
         for pid in busy[:1]:
             os.kill(pid, signal.SIGKILL)
             killed.append(pid)
-        time.sleep(0.01)
+        time.sleep(0.1)
     _, err = process.communicate(timeout=300)
     assert killed and process.returncode == 0, err
     assert (tmp_path / "a.h5").read_bytes() == whole[name], err
