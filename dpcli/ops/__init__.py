@@ -21,7 +21,6 @@ _HOME = {
     "gather_mean": "gather",
     "gather_points": "gather",
     "small_inverse": "small_inverses",
-    "small_inverse_reference": "small_inverses",
     "small_solve": "small_inverses",
     "weighted_kabsch": "rigid",
     "apply_motions": "rigid",

@@ -7,13 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend, run_in_threads
-
 GUARDS = ("signed", "release", "none")
 MIN_DET = 1e-6
-KERNEL_SIZE = 8  # largest n of the CPU kernels
+KERNEL_SIZE = 8  # largest n of the kernels that fit planes
 _CLOSED, _BLOCKS = 4, 16  # of the closed form, and of the block partition
-_ENTRY_NS = 2.5  # measured, per matrix entry
 
 
 def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
@@ -27,20 +24,12 @@ def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "s
     does, "none" leaves it: a singular matrix then gives inf or nan. A moved determinant carries no gradient.
     Cholesky has no determinant to move: with a guard, a matrix with a pivot below min_det of its trace has that much added
     to its diagonal (a matrix of zeros min_det itself), and that carries no gradient either.
-    Backends: to n = 8 a numba kernel on CPU, else torch; equal up to rounding. Raises ValueError on a wrong shape, dtype
-    or guard; torch.linalg.LinAlgError where Cholesky meets a finite matrix that is not even then positive definite.
+    One form for all devices; the kernels that fit planes on a CPU invert for themselves. Raises ValueError on a wrong shape,
+    dtype or guard; torch.linalg.LinAlgError where Cholesky meets a finite matrix that is not even then positive definite.
 
     >>> small_inverse(torch.tensor([[2.0, 1.0], [1.0, 1.0]])).tolist()
     [[1.0, -1.0], [-1.0, 2.0]]
     """
-    _check(matrices, guard)
-    if matrices.shape[-1] <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
-        return _KernelInverse.apply(matrices, min_det, guard)
-    return _inverse(matrices, min_det, guard)
-
-
-def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
-    """Computes `small_inverse` in plain torch, as a reference: same arguments, same guard."""
     _check(matrices, guard)
     return _inverse(matrices, min_det, guard)
 
@@ -189,35 +178,3 @@ def _adjugate4(*m: Tensor) -> tuple[list[Tensor], Tensor]:
             minor = m[4 * row + p] * w[qs] - m[4 * row + q] * w[ps] + m[4 * row + s] * w[pq]
             adjugate[4 * r + col] = minor if (r + col) % 2 == 0 else -minor
     return adjugate, det
-
-
-class _KernelInverse(torch.autograd.Function):
-    """Computes the inverse, and the gradient -X' G X' by the CPU kernel; autograd's own where the guard moved a determinant."""
-
-    @staticmethod
-    def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:
-        from dpcli.ops.cpu.small_inverses import inverse_kernel
-
-        flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
-        inverse, moved = torch.empty_like(flat), torch.empty(len(flat), dtype=torch.bool)
-        arrays = (flat.numpy(), inverse.numpy(), moved.numpy())
-        run_in_threads(inverse_kernel, (*arrays, min_det, GUARDS.index(guard)), len(flat), flat[0].numel() * _ENTRY_NS)
-        ctx.save_for_backward(flat, inverse, moved)
-        ctx.settings = (min_det, guard)
-        return inverse.view(matrices.shape)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
-        from dpcli.ops.cpu.small_inverses import inverse_gradient_kernel
-
-        flat, inverse, moved = ctx.saved_tensors
-        flat_grad, out = grad.reshape(flat.shape).contiguous(), torch.empty_like(flat)
-        arrays = (inverse.numpy(), flat_grad.numpy(), out.numpy())
-        run_in_threads(inverse_gradient_kernel, arrays, len(flat), flat[0].numel() * _ENTRY_NS)
-        rows = moved.nonzero()[:, 0]
-        if len(rows):
-            with torch.enable_grad():
-                part = flat[rows].requires_grad_()
-                out[rows] = torch.autograd.grad(_inverse(part, *ctx.settings), part, flat_grad[rows])[0]
-        return out.view(grad.shape), None, None

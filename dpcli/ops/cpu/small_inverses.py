@@ -152,66 +152,6 @@ def _workspace(n, like):
 
 
 @arithmetic_kernel
-def _load(matrices, first, size, tile, transposed):
-    """Loads matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
-    n = tile.shape[0]
-    low = np.uintp(first)
-    for i in range(np.uintp(n)):
-        for j in range(np.uintp(n)):
-            if transposed:
-                for w in range(np.uintp(size)):
-                    tile[i, j, w] = matrices[low + w, j, i]
-            else:
-                for w in range(np.uintp(size)):
-                    tile[i, j, w] = matrices[low + w, i, j]
-            if size < TILE:
-                tile[i, j, size:] = 1 if i == j else 0
-
-
-@arithmetic_kernel
-def _store(tile, matrices, first, size):
-    low = np.uintp(first)
-    for w in range(np.uintp(size)):
-        for i in range(np.uintp(tile.shape[0])):
-            for j in range(np.uintp(tile.shape[0])):
-                matrices[low + w, i, j] = tile[i, j, w]
-
-
-@arithmetic_kernel
-def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
-    """Inverts matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
-    floor = matrices.dtype.type(min_det)
-    tile, out, left, right, det, acted = _workspace(matrices.shape[1], matrices)
-    for low in range(first, last, TILE):
-        size = min(TILE, last - low)
-        _load(matrices, low, size, tile, False)
-        acted[:] = False
-        _invert(tile, out, left, right, det, acted, floor, guard)
-        _store(out, inverse, low, size)
-        for w in range(size):  # a slice assignment would compile an error message for 2 s
-            moved[low + w] = acted[w]
-
-
-@arithmetic_kernel
-def inverse_gradient_kernel(inverse, grad, out, first, last):
-    """Sets out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
-    n = inverse.shape[1]
-    x = np.empty((n, n, TILE), inverse.dtype)  # X'
-    g, inner, outer = np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype)
-    plus, minus = inverse.dtype.type(1), inverse.dtype.type(-1)
-    origin = (n - n, n - n)
-    for low in range(first, last, TILE):
-        size = min(TILE, last - low)
-        _load(inverse, low, size, x, True)
-        _load(grad, low, size, g, False)
-        inner[:] = 0
-        outer[:] = 0
-        _add_product(g, origin, x, origin, plus, inner, origin, (n, n, n))
-        _add_product(x, origin, inner, origin, minus, outer, origin, (n, n, n))
-        _store(outer, out, low, size)
-
-
-@arithmetic_kernel
 def _load_planes(moments, places, first, size, groups, tile, right, ridge):
     """Loads a tile (n,n,W) of normal matrices and one (n,W) of right sides of fits first..first+size-1, centroid by centroid.
 

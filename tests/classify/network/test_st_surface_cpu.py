@@ -14,7 +14,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.st_surface import surface_normal
 from dpcli.classify.network.st_surface_cpu import Fit, _Layout, fit_reduced, fit_reduced_reference
 from dpcli.ops.cpu.small_inverses import solve_planes, solve_planes_back
-from dpcli.ops.small_inverses import GUARDS, correct_guarded_gradients, small_inverse, small_inverse_reference
+from dpcli.ops.small_inverses import GUARDS, correct_guarded_gradients, small_inverse
 
 
 def unit(size, learned, coordinates, weighted, dtype, neighbors=24, dead=False):
@@ -189,7 +189,7 @@ def test_guarded_solutions_and_gradients_against_autograd(size, least, guard):
     planes = np.empty((count, n, groups), np.float32)
     solve_planes(flat, *rule, planes.reshape(-1))
     leaves = matrix.double().requires_grad_(), right.double().requires_grad_()
-    expected = (small_inverse_reference(leaves[0], min_det=least, guard=guard) * leaves[1][..., None, :]).sum(-1)
+    expected = (small_inverse(leaves[0], min_det=least, guard=guard) * leaves[1][..., None, :]).sum(-1)
     torch.testing.assert_close(
         torch.from_numpy(planes).transpose(1, 2).double(), expected.detach(), rtol=1e-4, atol=1e-5
     )
