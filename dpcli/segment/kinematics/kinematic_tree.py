@@ -14,7 +14,7 @@ from dpcli.segment.kinematics.registration import Registration, register, regist
 from dpcli.segment.kinematics.surface_directions import surface_directions
 from dpcli.segment.rigid_motions import HOLD
 from dpcli.store import CloudSequence, PartsSample
-from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
+from dpcli.store.joints import AXIS, FIXED, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
 _SURE = 0.05  # of the distance between neighboring points: no motion is known better
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
@@ -60,8 +60,8 @@ class KinematicTree:
 def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
     """Returns the tree of joints whose description length is least: a minimum spanning tree over the parts (Prim 1957).
 
-    An edge costs what its joint costs (`fit_joint`), and more the farther the two parts are apart; the larger part of two
-    is the parent of the fit. The root is the largest part. Raises DataError as `part_trajectories`.
+    An edge costs what its joint costs (`fit_joint`), and more the farther the two parts are apart. The root is the
+    largest part. Raises DataError as `part_trajectories`.
     """
     trajectories = part_trajectories(sequence, said)
     points = [
@@ -71,17 +71,63 @@ def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
     known = _registrations(sequence, trajectories, spacing) if len(points) > 1 else []
     directions = [surface_directions(cloud) for cloud in points]
     sizes = np.array([len(cloud) for cloud in points])
-    count = len(points)
-    gaps = _gaps(points, spacing)
-    fits, cost = {}, np.full((count, count), np.inf)
+    fits = _PairFits(known, trajectories.seen, directions, sizes)
+    cost, gaps = np.full((len(points), len(points)), np.inf), _gaps(points, spacing)
     for a, b in _neighbors(gaps):
-        a, b = (a, b) if (sizes[a], -a) >= (sizes[b], -b) else (b, a)
-        both = np.concatenate([directions[a], directions[b]])
-        fits[a, b] = _relative_joint(known[a], known[b], trajectories.seen[:, a] & trajectories.seen[:, b], both)
-        cost[a, b] = cost[b, a] = fits[a, b].length + _APART * gaps[a, b] - _LARGE * sizes[a] / sizes.max()
+        price = _APART * gaps[a, b] - _LARGE * max(sizes[a], sizes[b]) / sizes.max()
+        cost[a, b] = cost[b, a] = fits.joint(a, b).length + price
     root = int(sizes.argmax())
-    joints = [PartJoint(child, parent, _oriented(fits, parent, child)) for parent, child in _spanning_tree(cost, root)]
-    return KinematicTree(trajectories, points, root, joints)
+    return KinematicTree(trajectories, points, root, _cheapest_joints(fits, cost, root))
+
+
+class _PairFits:
+    """Fits the joint between two parts when it is asked for, once; the larger of the two is the parent of the fit."""
+
+    def __init__(
+        self, known: list[Registration], seen: np.ndarray, directions: list[np.ndarray], sizes: np.ndarray
+    ) -> None:
+        """Takes the parts' motions with their errors; seen bool (T,K), directions of the surfaces and sizes i (K) are theirs, too."""
+        self.sizes = sizes
+        self._known, self._seen, self._directions = known, seen, directions
+        self._found: dict[tuple[int, int], JointFit] = {}
+
+    def joint(self, parent: int, child: int) -> JointFit:
+        """Returns the joint with the parent's part as the parent: turned round where it was fitted the other way.
+
+        In frame 0 both parts' coordinates are the frame's, and a joint's axis is at rest in both, so only the sign of the value
+        changes.
+        """
+        a, b = sorted((parent, child), key=lambda k: (-self.sizes[k], k))
+        if (a, b) not in self._found:
+            both = np.concatenate([self._directions[a], self._directions[b]])
+            seen = self._seen[:, a] & self._seen[:, b]
+            self._found[a, b] = _relative_joint(self._known[a], self._known[b], seen, both)
+        fit = self._found[a, b]
+        return fit if (parent, child) == (a, b) else replace(fit, value=-fit.value)
+
+
+def _cheapest_joints(fits: _PairFits, cost: np.ndarray, root: int) -> list[PartJoint]:
+    """Returns the joints of the cheapest tree, each after its parent's, by the costs (K,K) of the edges.
+
+    A part whose motion is hardly known could be fixed to each of two others that move against each other, so parts that are
+    fixed to one another count as one body: what would be fixed to any of them is joined to it as to the largest.
+    """
+    cost, joints, inside = cost.copy(), [], [root]
+    largest = np.arange(len(cost))  # part of the body of each
+    instead: dict[tuple[int, int], JointFit] = {}  # joints of edges that would be fixed
+    while len(inside) < len(cost):
+        parent, child = _cheapest_edge(cost, inside)
+        fit = instead.get((parent, child)) or fits.joint(parent, child)
+        if fit.kind == FIXED and (of_all := fits.joint(int(largest[parent]), child)).kind != FIXED:
+            instead[parent, child] = of_all
+            cost[parent, child] += of_all.length - fit.length
+            continue
+        if fit.kind == FIXED:
+            body = np.isin(largest, [largest[parent], child])
+            largest[body] = max(int(largest[parent]), child, key=lambda k: fits.sizes[k])
+        joints.append(PartJoint(child, parent, fit))
+        inside.append(child)
+    return joints
 
 
 def _spacing(points: list[np.ndarray]) -> float:
@@ -147,24 +193,17 @@ def _spanning_tree(cost: np.ndarray, root: int) -> list[tuple[int, int]]:
     """Returns the edges (parent, child) of the cheapest tree, each after its parent's."""
     inside, edges = [root], []
     while len(inside) < len(cost):
-        outside = [k for k in range(len(cost)) if k not in inside]
-        choice = cost[np.ix_(inside, outside)]
-        row, column = np.unravel_index(choice.argmin(), choice.shape)
-        edges.append((inside[row], outside[column]))
-        inside.append(outside[column])
+        edges.append(_cheapest_edge(cost, inside))
+        inside.append(edges[-1][1])
     return edges
 
 
-def _oriented(fits: dict[tuple[int, int], JointFit], parent: int, child: int) -> JointFit:
-    """Returns the joint with the parent's part as the parent: turned round where it was fitted the other way.
-
-    In frame 0 both parts' coordinates are the frame's, and a joint's axis is at rest in both, so only the sign of the value
-    changes.
-    """
-    if (parent, child) in fits:
-        return fits[parent, child]
-    fit = fits[child, parent]
-    return replace(fit, value=-fit.value)
+def _cheapest_edge(cost: np.ndarray, inside: list[int]) -> tuple[int, int]:
+    """Returns the edge that costs least of those from a part of the tree to one outside of it."""
+    outside = [k for k in range(len(cost)) if k not in inside]
+    choice = cost[np.ix_(inside, outside)]
+    row, column = np.unravel_index(choice.argmin(), choice.shape)
+    return inside[row], outside[column]
 
 
 def unseen_motions(tree: KinematicTree, kinds: tuple[int, ...]) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.segment.kinematics.joint_fit import JointFit, _at_best_value, fit_joint, nearest_joints
-from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
+from dpcli.segment.kinematics.kinematic_tree import _cheapest_joints, kinematic_tree
 from dpcli.segment.kinematics.part_trajectories import part_trajectories, points_at_start
 from dpcli.segment.kinematics.registration import (
     Registration,
@@ -333,3 +333,33 @@ def test_what_is_hardly_seen_is_no_parent():
     sequence.part[sequence.frame_offsets[1] :][sequence.part[sequence.frame_offsets[1] :] == 2] = 0
     tree = kinematic_tree(sequence, said)
     assert {(joint.child, joint.parent) for joint in tree.joints if joint.fit.kind == REVOLUTE} in ({(1, 0)}, {(0, 1)})
+
+
+class _Fits:
+    """Joints of known types and lengths, of parts 0 (the largest) to 3."""
+
+    sizes = np.array([1600, 130, 120, 26])
+
+    def __init__(self, **told):
+        self.told = told  # a pair of parts, such as p01: type and length
+
+    def joint(self, parent, child):
+        kind, length = self.told[f"p{min(parent, child)}{max(parent, child)}"]
+        return JointFit(kind, np.eye(3)[0], np.zeros(3), np.zeros(4), 0.0, length)
+
+
+def _joined(**told):
+    fits, cost = _Fits(**told), np.full((4, 4), np.inf)
+    for a, b in (map(int, pair[1:]) for pair in told):
+        cost[a, b] = cost[b, a] = fits.joint(a, b).length
+    cost[1, 2] = cost[2, 1] = np.inf  # these don't touch
+    return {(joint.child, joint.parent, joint.fit.kind) for joint in _cheapest_joints(fits, cost, 0)}
+
+
+def test_what_is_fixed_to_a_part_is_fixed_to_all_that_is_fixed_to_it():
+    """Nothing tells how part 3 moves, so that it could be fixed to both flaps, which move against each other."""
+    flaps = {"p01": (REVOLUTE, 19.5), "p02": (REVOLUTE, 20.2), "p13": (FIXED, 8.0), "p23": (FIXED, 11.5)}
+    assert _joined(**flaps, p12=(FREE, 58.0)) == {(1, 0, REVOLUTE), (3, 1, FIXED), (2, 0, REVOLUTE)}
+    assert _joined(**flaps, p12=(FIXED, 7.0)) == {(1, 0, REVOLUTE), (3, 1, FIXED), (2, 3, FIXED)}
+    alone = {pair: flaps[pair] for pair in ("p01", "p13", "p23")}  # the only way to part 2
+    assert _joined(**alone, p12=(FREE, 58.0)) == {(1, 0, REVOLUTE), (3, 1, FIXED), (2, 3, FREE)}
