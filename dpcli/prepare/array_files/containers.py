@@ -7,13 +7,13 @@ import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.file_cache import cached_by_file
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
 from dpcli.prepare.array_files.attributes import says_text, texts_about
 from dpcli.prepare.array_files.mat5 import joined, read_variables
@@ -401,14 +401,9 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> np.ndarray | list
     return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else _checked(one, path)[()].T for one in inside])
 
 
+@cached_by_file(1)  # an array holds many sequences; each process reads it once
 def _read_all(path: Path) -> Mapping[str, Array | list[np.ndarray]]:
     """Returns the arrays of a file that is no HDF5."""
-    facts = path.stat()
-    return _read_once(path, facts.st_size, facts.st_mtime_ns)
-
-
-@lru_cache(maxsize=1)  # an array holds many sequences; each process reads it once
-def _read_once(path: Path, _size: int, _changed: int) -> Mapping[str, Array | list[np.ndarray]]:
     if path.suffix.lower() == ".npy":
         return {"": _npy(path)}
     if path.suffix.lower() == ".mat":

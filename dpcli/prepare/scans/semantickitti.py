@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.file_cache import cached_by_file
 from dpcli.path_names import first_names
 from dpcli.prepare.reader import Item, Reader, Sample, describe, require_folder, require_known, require_least
 from dpcli.prepare.scans.kitti_files import (
@@ -66,7 +66,7 @@ def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     return label & 0xFFFF, label
 
 
-@lru_cache(maxsize=4)
+@cached_by_file(4)
 def read_poses(path: Path) -> np.ndarray:
     """Reads poses.txt as f64 (scans,4,4): camera of each scan to the camera of scan 0."""
     try:
