@@ -106,9 +106,9 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     for item in items:
         facts = [item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path)]
         facts += map(fingerprint, item.extra.get("files", ()))
-        facts += map(fingerprint, series.paths[-1:] if (series := item.extra.get("series")) else ())
-        beside = getattr(item.extra.get("series"), "beside", None)  # times that may lie in the folder above
-        facts += beside.seconds.tolist() if beside else []
+        if series := item.extra.get("series"):
+            facts += map(fingerprint, series.paths[-1:])
+            facts += series.beside.seconds.tolist() if series.beside else []  # they may lie in the folder above
         digest.update("\n".join(map(str, facts)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}
