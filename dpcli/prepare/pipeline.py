@@ -283,7 +283,7 @@ def _open_writer(
         seed=conversion.seed,
         fields=reader.fields,
         compression=conversion.compression,
-        provenance=provenance,
+        provenance=[*reader.history, provenance],
         force=conversion.force,
         resume=resume,
     )
