@@ -58,9 +58,12 @@ def merge(
     a stop signal.
     """
     refuse_repeats([*inputs, output])
-    if labels is None and not prefix and (_no_clouds(inputs) or all(is_shard(open_source(path)) for path in inputs)):
+    may_be_shards = labels is None and not prefix
+    if may_be_shards and any(file_kind(path) != "clouds" for path in inputs):
         return _merge_shards(inputs, output, force, resume)
     readers = [open_source(path) for path in inputs]
+    if may_be_shards and all(map(is_shard, readers)):
+        return _merge_shards(inputs, output, force, resume)
     for reader in readers:
         warn_of_others(reader)
         if is_shard(reader):
@@ -71,14 +74,13 @@ def merge(
     return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
 
 
-def _no_clouds(inputs: Sequence[Path]) -> bool:
-    return any(file_kind(path) != "clouds" for path in inputs)
-
-
 def _merge_shards(inputs: Sequence[Path], output: Path, force: bool, resume: bool) -> Report:
-    there = output.exists() and not force
-    join_shards(inputs, output, force=force, resume=resume)
-    return count_samples(Report(was_complete=there), output)
+    report = Report(was_complete=output.exists() and not force)
+    joined = join_shards(inputs, output, force=force, resume=resume)
+    if isinstance(joined, CloudsReader):  # or one of parts
+        return count_samples(report, joined)
+    report.written, report.skipped = len(joined.names), joined.skipped
+    return report
 
 
 def _merge_unlike(
@@ -109,7 +111,7 @@ def _merge_unlike(
     }
     entry = record(config, 0, {f"{k}": reader.path for k, reader in enumerate(readers)})
     if not force and already_made(output, entry, CloudsReader):
-        return count_samples(Report(was_complete=True), output)
+        return count_samples(Report(was_complete=True), CloudsReader(output))
     parts = max(map(_count_parts, readers))
 
     def read(place: int) -> CloudSequence:
@@ -137,7 +139,7 @@ def _merge_unlike(
             length_unit=length_unit,
             fields=fields,
         )
-    return count_samples(Report(), output)
+    return count_samples(Report(), CloudsReader(output))
 
 
 def _common_unit(readers: list[CloudsReader]) -> str:

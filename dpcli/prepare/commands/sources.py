@@ -14,10 +14,9 @@ from dpcli.store.schema import fields_of, find_field
 
 def open_source(path: Path) -> CloudsReader:
     """Returns the reader of a clouds file, which opens the file again for its samples. Raises DataError when it is none."""
-    if file_kind(path) != "clouds":
-        raise DataError(
-            f"{path}: holds {file_kind(path)}; merge and split take clouds files, as dpc prepare makes them"
-        )
+    kind = file_kind(path)
+    if kind != "clouds":
+        raise DataError(f"{path}: holds {kind}; merge and split take clouds files, as dpc prepare makes them")
     return CloudsReader(path)
 
 

@@ -74,8 +74,8 @@ def is_shard(reader: Reader) -> bool:
     return bool(reader.provenance) and shard_of(reader.provenance[-1]) is not None
 
 
-def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, resume: bool = True) -> None:
-    """Joins all shards of one run, one item in memory at a time, into the file of a single run, byte for byte.
+def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, resume: bool = True) -> Reader:
+    """Joins all shards of one run, one item in memory at a time, into the file of a single run, byte for byte; returns its reader.
 
     Goes on where a stopped or killed join ended; does nothing where it is done. resume: off where nobody could run it again
     (a pipe). Raises UsageError for missing, repeated or mixed shards, and where `output` is there and another; DataError
@@ -92,7 +92,7 @@ def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, res
     pieces = [_read_piece(open_file(path)) for path in paths]
     history = _common_history(pieces)
     if not force and already_made(output, history[-1], open_file, keys=WORK):
-        return
+        return open_file(output)
     owner, row = _find_places(pieces, output, history[-1])
     pattern = next((piece.reader for piece in pieces if len(piece.reader.names)), pieces[0].reader)
     root = {"seed": int(pattern.attributes.get("seed", 0)), "source": str(pattern.attributes.get("source", ""))}
@@ -100,6 +100,7 @@ def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, res
     with make_writer(pattern, output, **root) as writer:
         _copy(pieces, owner, row, writer)
         writer.skipped = _skipped(pieces)
+    return open_file(output)
 
 
 def _read_piece(reader: Reader) -> _Piece:
