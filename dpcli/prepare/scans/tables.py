@@ -29,7 +29,7 @@ from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 from dpcli.prepare.decode.folder_listing import named_below, walk_folders
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.reader import Item, Sample, natural_key
-from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.cloud_series import left_out_below, refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SILENT, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
@@ -144,9 +144,9 @@ class TableSequences(OwnScans):
         if item.extra["part"]:  # the first sequence told the table's
             dropped = {what: count for what, count in dropped.items() if what != EMPTY}
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
-        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         silent = 0 if time is not None or part.joined else part.silent
-        sample.note({**dropped, **{note: 1 for note in part.notes}, JOINED: part.joined, SILENT: silent})
+        notes = {**dropped, **dict.fromkeys(part.notes, 1), JOINED: part.joined, SILENT: silent}
+        sample = self._assembled(item, clouds, time, notes)
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         if mixed:
             sample.note({MIXED.format(mixed): 1})
