@@ -14,6 +14,7 @@ PACKAGE = ROOT / "dpcli"
 COMMON = {
     "config_diff",
     "errors",
+    "file_cache",
     "file_lock",
     "npy_files",
     "counted",

@@ -17,6 +17,7 @@ _VIEW_OF_COMMANDS = (
     (r"--coordinates[ =]camera|prepare (depth|msraction3d|ntu60|synthetic gestures)\b", CAMERA_VIEW),
     (r"prepare (kitti-sf|kitti-det|semantickitti)\b", "-x-yz"),  # as published: x left, y up, z forward
     (r"prepare (sapien|synthetic articulated)\b", "x-zy"),
+    (r"prepare (video|animation|artemis|synthetic animal)\b", "x-y-z"),
     (r"generate4d export\b.*--axes[ =]keep", "x-y-z"),
     (r"generate4d export\b", CAMERA_VIEW),
 )
@@ -46,6 +47,8 @@ def default_view(length_unit: str, provenance: Sequence[Mapping[str, Any]] = ())
     ('xyz', 'yx-z')
     >>> default_view("m", [{"command": "dpc prepare kitti-sf RAW"}, {"command": "dpc segment predict"}])
     '-x-yz'
+    >>> default_view("", [{"command": "dpc prepare animation Fox.glb -o v.h5"}, {"command": "dpc prepare clouds v.h5"}])
+    'x-y-z'
     """
     return IMAGE_VIEW if "row, column" in length_unit else _known_view(provenance) or CAMERA_VIEW
 

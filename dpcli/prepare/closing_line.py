@@ -83,15 +83,14 @@ def _frames(reader: CloudsReader) -> str:
     shown += " frame" if high == 1 else " frames"
     if "time" not in reader.fields:
         return shown + (" without times" if high > 1 else "")
-    times, ends = reader.file["time"][:], np.cumsum(counts) - 1
-    steps = np.diff(times)
-    steps = np.delete(steps, ends[:-1][ends[:-1] < len(steps)])
+    steps = reader.frame_intervals()
     steps = steps[steps > 0]
     if not len(steps):
         return shown
     middle, least, most = float(median(steps)), float(steps.min()), float(steps.max())
     even = most < _EVEN * middle and middle < _EVEN * least
     apart = "" if even else f", {_number(least)} to {_number(most)} s apart"
+    times, ends = reader.file["time"][:], np.cumsum(counts) - 1
     spans = times[ends[counts > 1]] - times[ends[counts > 1] - counts[counts > 1] + 1]
     rates = (counts[counts > 1] - 1)[spans > 0] / spans[spans > 0]
     rate = _number(1 / middle)

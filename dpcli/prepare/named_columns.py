@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import pickletools
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.file_cache import cached_by_file
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.attributes import told_beside, told_units
 from dpcli.prepare.array_files.choosing import POINT_KEYS, find_sources, says_times
@@ -97,13 +97,8 @@ def holds_table(path: Path) -> bool:
         return True
 
 
+@cached_by_file(1)  # which is asked for again when the table is opened
 def _tables_of(path: Path) -> dict[str, Found]:
-    facts = path.stat()
-    return _read_once(path, facts.st_size, facts.st_mtime_ns)
-
-
-@lru_cache(maxsize=1)  # which is asked for again when the table is opened
-def _read_once(path: Path, _size: int, _changed: int) -> dict[str, Found]:
     """Returns the tables of points in a file by name: their columns (N each), what attributes say of the units of some, and
     what lies beside them.
 

@@ -27,9 +27,8 @@ from dpcli.runtime.machines.shards import Shard, describe_shard
 from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
-from dpcli.store import CloudsReader, CloudsWriter, ScoresReader, file_kind
+from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.heap_check import trust_heaps
-from dpcli.store.statistics import StatisticsReader
 from dpcli.store.writing.already_made import already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 from dpcli.store.writing.journal import journal_path
@@ -106,9 +105,9 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     for item in items:
         facts = [item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path)]
         facts += map(fingerprint, item.extra.get("files", ()))
-        facts += map(fingerprint, series.paths[-1:] if (series := item.extra.get("series")) else ())
-        beside = getattr(item.extra.get("series"), "beside", None)  # times that may lie in the folder above
-        facts += beside.seconds.tolist() if beside else []
+        if series := item.extra.get("series"):
+            facts += map(fingerprint, series.paths[-1:])
+            facts += series.beside.seconds.tolist() if series.beside else []  # they may lie in the folder above
         digest.update("\n".join(map(str, facts)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}
@@ -230,7 +229,7 @@ def convert(
         _tell_newer(kept, items)
     if not conversion.force and already_made(output, provenance, CloudsReader):
         report.was_complete = True
-        return count_samples(report, output)
+        return count_samples(report, CloudsReader(output))
     with _open_writer(output, reader, conversion, provenance, resume) as writer:
         taken = _write_items(writer, items, conversion)
         taken.run(
@@ -248,7 +247,7 @@ def convert(
             ),
         )
     trust_heaps(output)
-    return count_samples(report, output)
+    return count_samples(report, CloudsReader(output))
 
 
 def _write_items(writer: CloudsWriter, items: list[Item], conversion: Conversion) -> ItemPass:
@@ -283,19 +282,15 @@ def _open_writer(
         seed=conversion.seed,
         fields=reader.fields,
         compression=conversion.compression,
-        provenance=provenance,
+        provenance=[*reader.history, provenance],
         force=conversion.force,
         resume=resume,
     )
 
 
-def count_samples(report: Report, output: Path) -> Report:
+def count_samples(report: Report, reader: CloudsReader) -> Report:
     """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
-    if file_kind(output) in ("scores", "statistics"):
-        made = (ScoresReader if file_kind(output) == "scores" else StatisticsReader)(output)
-        report.written, report.skipped = len(made.names), made.skipped
-        return report
-    with CloudsReader(output) as reader:
+    with reader:
         report.written = len(reader)
         report.skipped = reader.skipped
         report.frames, report.points = int(reader.frame_counts.sum()), int(reader.point_counts.sum())

@@ -108,6 +108,11 @@ class Reader(Protocol):
         """Returns the options that decide the content, for the provenance: all that don't say where the raw data are."""
         return {name: value for name, value in asdict(self).items() if name not in ("raw", "inputs")}  # type: ignore[call-overload]
 
+    @property
+    def history(self) -> Sequence[dict[str, Any]]:
+        """Returns the provenance of what is read, which raw data don't have."""
+        return ()
+
     @abstractmethod
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""

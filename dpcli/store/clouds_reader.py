@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.counted import counted
 from dpcli.errors import DataError, reading
 from dpcli.store.file import (
-    absent,
+    data_set,
     open_store,
     read_positions,
     read_provenance,
@@ -56,7 +56,7 @@ class CloudsReader:
         self.length_unit = str(file.attrs.get("length_unit", ""))
         self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
         self.labels, self.subjects, self.cameras = (self._column(file, key) for key in ("label", "subject", "camera"))
-        self.num_points = len(self._data(file, "points"))
+        self.num_points = len(data_set(file, "points"))
         self._sequence_offsets = self._offsets(file, "sequence_offsets", None)
         frames = int(self._sequence_offsets[-1])
         self._frame_offsets = self._offsets(file, "frame_offsets", self.num_points)
@@ -89,17 +89,11 @@ class CloudsReader:
             if len(file[key]) != rows:
                 raise DataError(f"{self.path}: {key} has {len(file[key])} rows, expected {rows}")
 
-    def _data(self, file: h5py.File, name: str) -> h5py.Dataset:
-        """Returns a data set, of whose type and shape `open_store` has made sure."""
-        if name not in file:
-            raise absent(self.path, name)
-        return file[name]
-
     def _read_shifts(self, file: h5py.File) -> np.ndarray:
         """Returns what was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
         if "shift" not in file:
             return np.zeros((len(self.names), 3))
-        shifts = self._data(file, "shift")[:]
+        shifts = data_set(file, "shift")[:]
         if len(shifts) != len(self.names) or not np.isfinite(shifts).all():
             raise DataError(
                 f"{self.path}: shift has {len(shifts)} rows, expected {len(self.names)} of 3 finite numbers"
@@ -107,7 +101,7 @@ class CloudsReader:
         return shifts
 
     def _column(self, file: h5py.File, name: str) -> np.ndarray:
-        column = self._data(file, name)[:]
+        column = data_set(file, name)[:]
         if len(column) != len(self.names):
             raise DataError(f"{self.path}: {name} has {len(column)} rows for {len(self.names)} names")
         if column.min(initial=-1) < -1:
@@ -118,7 +112,7 @@ class CloudsReader:
         return column
 
     def _offsets(self, file: h5py.File, name: str, end: int | None) -> np.ndarray:
-        offsets = self._data(file, name)[:]
+        offsets = data_set(file, name)[:]
         if len(offsets) == 0 or offsets[0] != 0 or np.any(np.diff(offsets) < 0):
             raise DataError(f"{self.path}: {name} must start at 0 and never fall")
         if end is not None and offsets[-1] != end:
@@ -142,6 +136,13 @@ class CloudsReader:
     def point_counts(self) -> np.ndarray:
         """Counts the points of each sequence, i64 (S)."""
         return np.diff(self._frame_offsets[self._sequence_offsets])
+
+    def frame_intervals(self) -> np.ndarray:
+        """Returns the seconds from each frame to the next of the same sequence, f64; none where the file has no times."""
+        if "time" not in self.fields:
+            return np.zeros(0)
+        steps, last = np.diff(self._set("time")[:]), self._sequence_offsets[1:-1] - 1
+        return np.delete(steps, last[(last >= 0) & (last < len(steps))])
 
     def times(self, index: int) -> np.ndarray | None:
         """Returns when the frames of sequence `index` were taken, f64 (T), without its points; None where the file doesn't say."""

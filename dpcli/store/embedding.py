@@ -12,7 +12,7 @@ from dpcli.errors import DataError
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
     PACKED,
-    absent,
+    data_set,
     open_store,
     read_provenance,
     read_strings,
@@ -94,20 +94,16 @@ class EmbeddingReader:
             self.attributes, self.provenance = root_attributes(file), read_provenance(file)
             self.class_names = read_strings(file, "class_names")
             self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
-            for key in ("label", "features", "coordinates"):
-                if key not in file:
-                    raise absent(path, key)
-            self.labels = file["label"][:]
-            if set(file["features"]) != set(file["coordinates"]):
-                raise DataError(
-                    f"{path}: features of {sorted(file['features'])}, coordinates of {sorted(file['coordinates'])}"
-                )
+            label, features, places = (data_set(file, key) for key in ("label", "features", "coordinates"))
+            self.labels = label[:]
+            if set(features) != set(places):
+                raise DataError(f"{path}: features of {sorted(features)}, coordinates of {sorted(places)}")
             self.streams = {
                 stream: StreamEmbedding(
-                    file["features"][stream][:],
-                    file["coordinates"][stream][:],
-                    {key: float(value) for key, value in file["coordinates"][stream].attrs.items()},
+                    features[stream][:],
+                    places[stream][:],
+                    {key: float(value) for key, value in places[stream].attrs.items()},
                 )
-                for stream in file["features"]
+                for stream in features
             }
         _check(str(path), self.names, self.labels, self.splits, self.streams)

@@ -290,19 +290,22 @@ def read_positions(file: h5py.File) -> tuple[list[int], list[int]] | None:
 
 def read_strings(file: h5py.File, name: str, *, optional: bool = False) -> list[str]:
     """Returns a string data set as a list; when it is absent, none where that is `optional`, else DataError."""
-    if name not in file:
-        if optional:
-            return []
-        raise absent(file.filename, name)
+    if optional and name not in file:
+        return []
     try:
-        return list(file[name].asstr()[:])
+        return list(data_set(file, name).asstr()[:])
     except UnicodeDecodeError:
         raise DataError(f"{file.filename}: {name!r} is not UTF-8; the file was changed by another program") from None
 
 
-def absent(path: str | Path, name: str) -> DataError:
-    """Returns the error for a data set that a file should have."""
-    return DataError(f"{path}: data set {name!r} is missing; the file is incomplete, make it again")
+def data_set(file: h5py.File, name: str) -> h5py.Dataset:
+    """Returns a data set, or a group of some, that a file should have; of its type and shape `open_store` has made sure.
+
+    Raises DataError where it is absent.
+    """
+    if name not in file:
+        raise DataError(f"{file.filename}: data set {name!r} is missing; the file is incomplete, make it again")
+    return file[name]
 
 
 def write_strings(file: h5py.File, name: str, texts: Sequence) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import mmap
-import os
 import struct
-from functools import lru_cache
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.file_cache import cached_by_file, file_state
 
 _MAGIC, _HEAP = b"\x89HDF\r\n\x1a\n", b"GCOL\x01\0\0\0"  # of version 1, the only one
 _OBJECT = struct.Struct("<HHIQ")  # number, references, nothing, bytes; those follow, up to a multiple of 8
@@ -16,7 +15,7 @@ _HEAD, _STEP = 16, 8
 _USER_BLOCKS = (0, 512, 1024, 2048)  # where HDF5 may begin; MATLAB's files have a block of text before
 _LOOKED_AT = 1 << 26  # bytes at either end of a larger file: there are its attributes and its names
 
-_made_here: set[tuple[int, int, int]] = set()
+_made_here: set[tuple[int, int, int] | None] = set()
 
 
 def check_heaps(path: Path) -> None:
@@ -27,23 +26,17 @@ def check_heaps(path: Path) -> None:
     Files that are not HDF5 pass: opening them fails with a message. Files of more than 128 MiB are searched at both ends only. A
     file that did not change is searched once.
     """
-    state = _state(path)
-    if state not in _made_here:
-        _check_once(path, *state)
+    if file_state(path) not in _made_here:
+        _check_once(path)
 
 
 def trust_heaps(path: Path) -> None:
     """Notes that this process made the file as it is now: it is searched when another process, or a change, comes by."""
-    _made_here.add(_state(path))
+    _made_here.add(file_state(path))
 
 
-def _state(path: Path) -> tuple[int, int, int]:
-    found = os.stat(path)
-    return found.st_ino, found.st_size, found.st_mtime_ns
-
-
-@lru_cache(maxsize=256)
-def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
+@cached_by_file(256)
+def _check_once(path: Path) -> None:
     with open(path, "rb") as file:
         start = file.read(_USER_BLOCKS[-1] + 16)
         heads = (start[at : at + 16] for at in _USER_BLOCKS)

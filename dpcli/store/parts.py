@@ -14,7 +14,7 @@ from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import CloudsWriter
-from dpcli.store.file import PACKED, absent
+from dpcli.store.file import PACKED, data_set
 from dpcli.store.schema import fields_of
 from dpcli.store.sequence import LONGEST, NO_LENGTHS, TOLERANCE, CloudSequence, are_lengths, are_rigid
 
@@ -178,17 +178,16 @@ class PartsReader(CloudsReader):
 
     def _load_index(self, file: h5py.File) -> None:
         super()._load_index(file)
-        if "part" not in self.fields:
-            raise absent(self.path, "part")
+        data_set(file, "part")
         probability = file.get("part_probability")
         if probability is None or len(probability) != self.num_points:
             found = "is missing" if probability is None else f"has shape {probability.shape}"
             raise DataError(f"{self.path}: part_probability {found}, expected ({self.num_points}, parts)")
         self.num_parts = int(probability.shape[1])
-        self._pair_offsets = self._rising(file, "pair_offsets", len(self.names), len(self._data(file, "pair")))
+        self._pair_offsets = self._rising(file, "pair_offsets", len(self.names), len(data_set(file, "pair")))
         pairs = int(self._pair_offsets[-1])
-        self._flow_offsets = self._rising(file, "flow_offsets", pairs, len(self._data(file, "flow")))
-        motions = self._data(file, "part_motion").shape
+        self._flow_offsets = self._rising(file, "flow_offsets", pairs, len(data_set(file, "flow")))
+        motions = data_set(file, "part_motion").shape
         if motions[1] != self.num_parts:
             raise DataError(f"{self.path}: part_motion has shape {motions}, expected (n, {self.num_parts}, 4, 4)")
         if motions[0] != pairs:

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.store.file import (
     PACKED,
-    absent,
+    data_set,
     open_store,
     read_positions,
     read_provenance,
@@ -135,10 +135,7 @@ class ScoresReader:
             self.attributes, self.provenance = root_attributes(file), read_provenance(file)
             self.class_names = read_strings(file, "class_names")
             self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
-            for key in ("scores", "label"):
-                if key not in file:
-                    raise absent(path, key)
-            self.scores, self.labels = file["scores"][:], file["label"][:]
+            self.scores, self.labels = (data_set(file, key)[:] for key in ("scores", "label"))
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
             self.rejected = file["rejected"][:].astype(bool) if "rejected" in file else None
             self.skipped, self.positions = read_skipped(file), read_positions(file)

@@ -78,7 +78,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             "frames_per_sequence": _spread(reader.frame_counts),
             "points_per_frame": _spread(reader.frame_sizes),
             "parts_per_sequence": _spread(_part_counts(reader)),
-            "frame_interval": _spread(_intervals(reader), float),
+            "frame_interval": _spread(reader.frame_intervals(), float),
             "fields": [*reader.fields, *(f"activation/{stream}" for stream in reader.file.get("activation", ()))],
             "range": ranges,
             "shifts": {name: shift.tolist() for name, shift in zip(reader.names, reader.shifts) if shift.any()},
@@ -229,15 +229,6 @@ def _column_ends(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ends = [wide.min(axis=0).reshape(-1, 3), wide.max(axis=0).reshape(-1, 3)] if whole else []
     few = np.concatenate([*ends, block[whole:]])
     return few.min(axis=0), few.max(axis=0)
-
-
-def _intervals(reader: CloudsReader) -> np.ndarray:
-    """Returns the seconds from each frame to the next of the same sequence; empty without times."""
-    if "time" not in reader.fields:
-        return np.zeros(0)
-    steps = np.diff(reader.file["time"][:])
-    ends = np.cumsum(reader.frame_counts)[:-1] - 1
-    return np.delete(steps, ends[(ends >= 0) & (ends < len(steps))])
 
 
 def _spread(values: np.ndarray, kind: type = int) -> dict[str, float] | None:

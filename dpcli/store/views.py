@@ -16,7 +16,7 @@ from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import (
     PACKED,
-    absent,
+    data_set,
     history_of,
     open_store,
     read_provenance,
@@ -236,14 +236,14 @@ class ViewsReader:
             self.fields = tuple(key for key in ("track", "part") if key in file)
 
     def _load_header(self, file: h5py.File) -> ViewsHeader:
-        for key in ("rgba", "intrinsics", "world_to_camera", "time"):
-            if key not in file:
-                raise absent(self.path, key)
+        rgba, intrinsics, poses, time = (
+            data_set(file, key) for key in ("rgba", "intrinsics", "world_to_camera", "time")
+        )
         for key in ("name", "reference"):
             if key not in file.attrs:
                 raise DataError(f"{self.path}: attribute {key!r} is missing; the file is incomplete, make it again")
-        role, rgba = read_strings(file, "role"), file["rgba"]
-        found = (len(role), len(file["time"]))
+        role = read_strings(file, "role")
+        found = (len(role), len(time))
         if rgba.shape[:2] != found:
             raise DataError(
                 f"{self.path}: rgba is {rgba.dtype} {rgba.shape}, expected uint8 "
@@ -251,9 +251,9 @@ class ViewsReader:
             )
         header = ViewsHeader(
             str(self.attributes["name"]),
-            file["intrinsics"][:],
-            file["world_to_camera"][:],
-            file["time"][:],
+            intrinsics[:],
+            poses[:],
+            time[:],
             role,
             int(self.attributes["reference"]),
             (rgba.shape[3], rgba.shape[2]),

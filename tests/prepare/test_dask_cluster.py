@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import signal
 import threading
@@ -17,12 +16,9 @@ import pytest
 from dpcli.errors import UsageError
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item, Sample
+from dpcli.runtime.provenance import file_digest
 from dpcli.store.writing.item_pass import ItemPass
 from tests.support.prepare_helpers import ToyReader, dpc
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ def test_any_executor_gives_the_same_bytes_with_few_in_flight(tmp_path, monkeypa
     monkeypatch.setattr(ItemPass, "_take", lambda *given: (waiting.__setitem__(0, waiting[0] - 1), take(*given)))
     with Counting(3) as executor:
         report = convert(ToyReader(count=20, bad=(3,)), tmp_path / "a.h5", slots=3, executor=executor)
-    assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5") and report.skipped == whole.skipped
+    assert file_digest(tmp_path / "a.h5") == file_digest(tmp_path / "whole.h5") and report.skipped == whole.skipped
     assert most[0] <= 6
 
 
@@ -97,7 +93,7 @@ def test_a_lost_worker_costs_only_time(cluster, tmp_path):
         report = convert(reader, tmp_path / "a.h5", slots=slots, executor=executor)
     thread.join()
     assert lost and report.written == 40
-    assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
+    assert file_digest(tmp_path / "a.h5") == file_digest(tmp_path / "whole.h5")
     readers = {path.stem for path in tmp_path.glob("*.pid")}
     assert len(readers - own) >= 2 and own.isdisjoint(readers)
 
@@ -111,7 +107,7 @@ def test_a_sample_that_kills_every_worker_is_passed_over_by_name(cluster, tmp_pa
     ((name, reason),) = report.skipped
     assert report.written == 5 and name == "toy004" and "the process that worked on it died" in reason
     convert(reader, tmp_path / "b.h5", Conversion(jobs=2))
-    assert digest(tmp_path / "a.h5") == digest(tmp_path / "b.h5")
+    assert file_digest(tmp_path / "a.h5") == file_digest(tmp_path / "b.h5")
 
 
 def test_the_command_on_a_local_cluster(tmp_path):
@@ -120,7 +116,7 @@ def test_the_command_on_a_local_cluster(tmp_path):
     done = dpc(*words, "-o", tmp_path / "a.h5", "--dask", "local", "--jobs", "2")
     assert done.returncode == 0 and "2 workers" in done.stderr and "Traceback" not in done.stderr, done.stderr
     assert dpc(*words, "-o", tmp_path / "b.h5", "--jobs", "1").returncode == 0
-    assert digest(tmp_path / "a.h5") == digest(tmp_path / "b.h5")
+    assert file_digest(tmp_path / "a.h5") == file_digest(tmp_path / "b.h5")
 
 
 def test_addresses_that_are_none():

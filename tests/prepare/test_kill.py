@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import shutil
 import subprocess
@@ -19,6 +18,7 @@ from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.prepare import pipeline
 from dpcli.prepare.pipeline import Conversion, convert, convert_item
 from dpcli.runtime import pool
+from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store import clouds_writer as writer_module
 from dpcli.store.writing import item_pass
@@ -28,10 +28,6 @@ from tests.support.sessions import members
 
 SYNTHETIC = ("prepare", "synthetic", "gestures", "--frames", "8", "--size", "64", "--videos-per-class", "6")
 ABOUT = {"kind": "clouds", "provenance": [{"config": 1}]}
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def sequence(number: int) -> CloudSequence:
@@ -69,7 +65,7 @@ def killed(small_chunks, tmp_path_factory) -> tuple[bytes, list[int], bytes, str
     with CloudsWriter(folder / "whole.h5", **options()) as writer:
         for number in range(5):
             writer.write(sequence(number))
-    return content, ends, unfinished, digest(folder / "whole.h5")
+    return content, ends, unfinished, file_digest(folder / "whole.h5")
 
 
 @settings(max_examples=80, deadline=None)
@@ -89,7 +85,7 @@ def test_a_journal_cut_anywhere_or_damaged_gives_the_samples_before(killed, tmp_
     (folder / ".a.h5.alt").write_bytes(data.draw(st.sampled_from([b"", b"\x89HDF\r\n\x1a\n", b"x" * 5000])))
     (folder / ".a.h5.part.new").write_bytes(data.draw(st.sampled_from([b"", content[: cut // 2]])))
     go_on(folder, max([0, *(k for k, end in enumerate(ends) if end <= sound)]))
-    assert digest(folder / "a.h5") == whole
+    assert file_digest(folder / "a.h5") == whole
     assert [path.name for path in folder.iterdir()] == ["a.h5"]
 
 
@@ -114,7 +110,7 @@ def test_points_that_are_not_in_the_unfinished_file_are_not_taken(killed, tmp_pa
     elif damage == "cut":
         (tmp_path / ".a.h5.new").write_bytes(unfinished[: at + 5])
     go_on(tmp_path, number if damage != "gone" else first_placed())
-    assert digest(tmp_path / "a.h5") == whole
+    assert file_digest(tmp_path / "a.h5") == whole
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
@@ -159,7 +155,7 @@ def test_a_kill_while_going_on_loses_nothing(killed, tmp_path, monkeypatch, reac
                 if stop:
                     raise Stopped("now")
                 writer.write(sequence(4))
-        assert digest(place / "a.h5") == whole
+        assert file_digest(place / "a.h5") == whole
         assert [path.name for path in place.iterdir()] == ["a.h5"]
 
 
@@ -167,7 +163,7 @@ def test_a_journal_of_another_version_starts_over(killed, tmp_path):
     (tmp_path / ".a.h5.part").write_bytes(killed[0].replace(b"dpc journal 3", b"dpc journal 2", 1))
     (tmp_path / ".a.h5.new").write_bytes(killed[2])
     go_on(tmp_path, 0)
-    assert digest(tmp_path / "a.h5") == killed[3]
+    assert file_digest(tmp_path / "a.h5") == killed[3]
 
 
 def test_a_journal_gives_back_what_went_in(tmp_path):
@@ -258,7 +254,7 @@ def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
     read = []
     monkeypatch.setattr(pipeline, "convert_item", lambda *a, **k: read.append(a[-1][0]) or convert_item(*a, **k))
     assert convert(ToyReader(), tmp_path / "a.h5").written == whole.written
-    assert read == [3, 4] and digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
+    assert read == [3, 4] and file_digest(tmp_path / "a.h5") == file_digest(tmp_path / "whole.h5")
 
 
 def test_kill_minus_nine_at_random_moments(tmp_path):
@@ -290,5 +286,5 @@ def test_kill_minus_nine_at_random_moments(tmp_path):
         assert not members(process.pid)
     last = dpc(*SYNTHETIC, "-o", out, "--jobs", "2")
     assert last.returncode == 0 and ("continuing: " in last.stderr or "already complete" in last.stderr), last.stderr
-    assert digest(out) == digest(tmp_path / "whole.h5")
+    assert file_digest(out) == file_digest(tmp_path / "whole.h5")
     assert {path.name for path in tmp_path.iterdir()} == {"out.h5", "whole.h5"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import pickle
 import signal
@@ -26,12 +25,9 @@ from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from dpcli.prepare.scans.tables import TableSequences
 from dpcli.prepare.thinning import Thinning, voxel_representatives
+from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import ToyReader, write_msr
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def toy_sequence(counts: list[int]) -> CloudSequence:
@@ -93,9 +89,9 @@ def test_bytes_do_not_depend_on_the_number_of_jobs(tmp_path):
     for jobs in (1, 2):
         report = convert(MSRAction3D(raw), tmp_path / f"{jobs}.h5", Conversion(jobs=jobs, points=10, seed=5))
         assert (report.written, len(report.skipped)) == (8, 1)
-    assert digest(tmp_path / "1.h5") == digest(tmp_path / "2.h5")
+    assert file_digest(tmp_path / "1.h5") == file_digest(tmp_path / "2.h5")
     convert(MSRAction3D(raw), tmp_path / "other.h5", Conversion(points=10, seed=6))
-    assert digest(tmp_path / "other.h5") != digest(tmp_path / "1.h5")
+    assert file_digest(tmp_path / "other.h5") != file_digest(tmp_path / "1.h5")
 
 
 def _write_inputs(folder: Path, suffix: str, count: int) -> Path:
@@ -201,10 +197,10 @@ def test_unreadable_files_are_bad_samples_and_bugs_are_not(tmp_path, monkeypatch
 def test_running_again_says_already_complete(tmp_path):
     path = tmp_path / "a.h5"
     convert(ToyReader(), path, Conversion(points=20))
-    before = (digest(path), path.stat().st_mtime_ns)
+    before = (file_digest(path), path.stat().st_mtime_ns)
     report = convert(ToyReader(), path, Conversion(points=20))
     assert report.was_complete and report.written == 5
-    assert (digest(path), path.stat().st_mtime_ns) == before
+    assert (file_digest(path), path.stat().st_mtime_ns) == before
 
 
 @pytest.mark.parametrize(
@@ -220,12 +216,12 @@ def test_running_again_says_already_complete(tmp_path):
 def test_another_configuration_is_refused_unless_forced(tmp_path, reader, options, message):
     path = tmp_path / "a.h5"
     convert(ToyReader(), path, Conversion(points=20))
-    before = digest(path)
+    before = file_digest(path)
     with pytest.raises(UsageError, match=message):
         convert(reader, path, Conversion(**{"points": 20, **options}))
-    assert digest(path) == before
+    assert file_digest(path) == before
     convert(reader, path, Conversion(force=True, **{"points": 20, **options}))
-    assert digest(path) != before
+    assert file_digest(path) != before
 
 
 def test_a_foreign_file_is_not_overwritten(tmp_path):
@@ -287,7 +283,7 @@ def test_a_stopped_run_is_continued_to_the_same_bytes(tmp_path, monkeypatch, num
     monkeypatch.setattr(pipeline, "convert_item", lambda *a, **k: read.append(a[-1][0]) or convert_item(*a, **k))
     report = convert(reader, path, Conversion(points=20))
     assert set(read) == set(range(9)) - ({0, 1, 2} if not bad else {1, 3, 4})  # good ones are not read again
-    assert digest(path) == digest(tmp_path / "whole.h5")
+    assert file_digest(path) == file_digest(tmp_path / "whole.h5")
     assert (report.written, report.skipped) == (whole.written, whole.skipped)
     assert {p.name for p in tmp_path.iterdir()} == {"a.h5", "whole.h5"}
 
@@ -318,7 +314,7 @@ def test_a_part_of_another_configuration_is_refused_and_force_starts_over(tmp_pa
         convert(ToyReader(), path, Conversion(points=10))
     convert(ToyReader(), path, Conversion(points=10, force=True))
     convert(ToyReader(), tmp_path / "fresh.h5", Conversion(points=10))
-    assert digest(path) == digest(tmp_path / "fresh.h5")
+    assert file_digest(path) == file_digest(tmp_path / "fresh.h5")
 
 
 @pytest.mark.parametrize("old_date", [False, True])  # as what an archive or `rsync -a` puts there has

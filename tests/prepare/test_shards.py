@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item
 from dpcli.runtime.machines.shards import Shard, describe_shard, shard_of
-from dpcli.runtime.provenance import command_line
+from dpcli.runtime.provenance import command_line, file_digest
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions
 from tests.support.commands import told as dpc
@@ -33,10 +32,6 @@ SYNTHETIC = (
     "--jobs",
     "1",
 )
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def cut(reader: ToyReader, folder: Path, count: int, **options) -> list[Path]:
@@ -61,7 +56,7 @@ def test_any_cut_gives_the_same_bytes(tmp_path_factory, count, bad, data):
     whole = convert(reader, folder / "whole.h5", Conversion(points=20))
     paths = data.draw(st.permutations(cut(reader, folder, count)))
     merged = merge(paths, folder / "all.h5")
-    assert digest(folder / "all.h5") == digest(folder / "whole.h5")
+    assert file_digest(folder / "all.h5") == file_digest(folder / "whole.h5")
     assert (merged.written, merged.skipped) == (whole.written, whole.skipped)
 
 
@@ -138,6 +133,6 @@ def test_the_commands_give_the_bytes_of_one_run(tmp_path):
         assert dpc(*SYNTHETIC, "--shard", f"{index}/2", "-o", path).returncode == 0
     assert dpc("prepare", "merge", *shards, "-o", tmp_path / "all.h5").returncode == 0
     assert dpc(*SYNTHETIC, "-o", tmp_path / "whole.h5").returncode == 0
-    assert digest(tmp_path / "all.h5") == digest(tmp_path / "whole.h5")
+    assert file_digest(tmp_path / "all.h5") == file_digest(tmp_path / "whole.h5")
     wrong = dpc(*SYNTHETIC, "--shard", "2/2", "-o", tmp_path / "x.h5")
     assert wrong.returncode == 2 and "0/16 ... 15/16" in wrong.stderr

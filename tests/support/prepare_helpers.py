@@ -5,14 +5,14 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.reader import Item, Sample
+from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.store import CloudSequence
 
 DPC = [sys.executable, "-m", "dpcli"]
@@ -64,14 +64,14 @@ def write_video(path: Path, frames: np.ndarray, codec: str = "FFV1", fps: float 
 
 
 @dataclass(frozen=True)
-class ToyReader:
+class ToyReader(Reader):
     """A reader without files; items whose number is in ``bad`` fail."""
 
     count: int = 5
     points: int = 50
     bad: tuple[int, ...] = ()
     config_extra: str = ""
-    class_names: list[str] = field(default_factory=lambda: ["a", "b"])
+    class_names: tuple[str, ...] = ("a", "b")
     length_unit: str = "m"
     fields: tuple[str, ...] = ()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import ClassVar
@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.prepare.actions.shrec17_lists import IMAGE_UNIT, PUBLISHED, find_lists, gesture_names, listed_items
+from dpcli.prepare.actions.shrec17_lists import IMAGE_UNIT, PUBLISHED, Entry, entries, find_lists, gesture_names
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -99,16 +99,32 @@ class Shrec17(Reader):
     def items(self) -> list[Item]:
         lists = find_lists(self.raw)
         root = lists[0].path.parent
-        items = {
-            item.name: item if item.problem else _with_folder_problem(item)
-            for item in listed_items(lists, self.classes)
-        }
+        items = {item.name: item for item in (self._item(root, *line) for line in entries(lists))}
         listed = {item.path for item in items.values()}
         for folder in sorted(root.glob("gesture_*/finger_*/subject_*/essai_*")):
             if folder not in listed:
                 name = folder.relative_to(root).as_posix()
                 items[name] = Item(name, folder, problem=f"{folder}: in neither list file, so its split is unknown")
         return sorted(items.values(), key=lambda item: natural_key(item.name))
+
+    def _item(self, root: Path, split: str, where: str, entry: Entry | str) -> Item:
+        """Returns the item of a line of a list, FILE:LINE, whose sequence's folder lies beside the lists."""
+        if isinstance(entry, str):
+            return Item(where, root, split, problem=entry)
+        folder, problem = root / entry.folder, ""
+        if not folder.is_dir():
+            problem = f"{root}: {where} names {entry.folder}, which does not exist"
+        elif target := leads_out(folder, root):
+            problem = f"{folder}: a link that leads out of the data, to {target}; copy the folder here"
+        return Item(
+            entry.folder,
+            folder,
+            split,
+            label=entry.label(self.classes),
+            subject=entry.subject,
+            problem=problem,
+            extra={"root": root, "frames": entry.frames},
+        )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         frames, notes = self._frame_paths(item)
@@ -172,16 +188,6 @@ class Shrec17(Reader):
 
     def summary(self, items: list[Item]) -> list[str]:
         return published_found(items, PUBLISHED, "gestures")
-
-
-def _with_folder_problem(item: Item) -> Item:
-    """Returns the item, with a problem when its folder is missing or a link out of the data."""
-    root, problem = item.extra["root"], ""
-    if not item.path.is_dir():
-        problem = f"{root}: {item.extra['line']} names {item.name}, which does not exist"
-    elif target := leads_out(item.path, root):
-        problem = f"{item.path}: a link that leads out of the data, to {target}; copy the folder here"
-    return replace(item, problem=problem) if problem else item
 
 
 def _clip_to_image(region: np.ndarray) -> tuple[int, int, int, int]:

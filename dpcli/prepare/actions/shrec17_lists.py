@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.reader import Item, require_folder
+from dpcli.prepare.reader import require_folder
 
 GESTURES = (
     "grab",
@@ -141,24 +141,3 @@ def gesture_names(lists: Sequence[ListFile], labels: int) -> list[str]:
             gesture = (entry.gesture,) if labels == 14 else (entry.gesture, entry.finger)
             names[entry.label(labels)] = _words(gesture)
     return names
-
-
-def listed_items(lists: Sequence[ListFile], labels: int) -> list[Item]:
-    """Returns one item per line, in the order of the lists; ``path`` is the sequence's folder beside the lists."""
-    items = []
-    for split, where, entry in entries(lists):
-        root = lists[0].path.parent
-        if isinstance(entry, str):
-            items.append(Item(where, root, split, problem=entry))
-        else:
-            items.append(
-                Item(
-                    entry.folder,
-                    root / entry.folder,
-                    split,
-                    label=entry.label(labels),
-                    subject=entry.subject,
-                    extra={"root": root, "frames": entry.frames, "line": where},
-                )
-            )
-    return items

@@ -7,13 +7,13 @@ import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.file_cache import cached_by_file
 from dpcli.npy_files import map_npy, open_archive, read_header, read_member, require_room
 from dpcli.prepare.array_files.attributes import says_text, texts_about
 from dpcli.prepare.array_files.mat5 import joined, read_variables
@@ -30,7 +30,6 @@ _FEW = 1 << 20  # elements of a list of arrays
 _ROWS_OF_CAMERA = 4  # of the largest arrays that tell of a camera, and of no points
 _OBJECT = "MATLAB_object_decode"  # the attribute of what MATLAB keeps elsewhere in the file: tables, dates, texts
 _OCTAVE = "OCTAVE_NEW_FORMAT"  # the attribute of what Octave's save -hdf5 writes
-_names: dict[tuple[Path, int, int], ByName[str]] = {}  # arrays in the HDF5 file opened last, and where they lie
 Content = TypeVar("Content")
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
@@ -244,23 +243,22 @@ def _hdf5_of_others(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Mapping[str, Array | list[np.ndarray]]]:
-    facts = path.stat()
-    state = path, facts.st_size, facts.st_mtime_ns
+    names = _names_in(path)
     with _hdf5_of_others(path) as file:
-        if state not in _names:
-            items = dict(_datasets(file, path))
-            shown = {name: _shown(file, item, path) for name, item in items.items()}
-            found = {name: array for name, array in shown.items() if array is not None}
-            _names.clear()  # of the file before
-            _names[state] = ByName({name: items[name].name for name in found})
-            _names[state].cells = {
-                name: array for name, array in found.items() if isinstance(array, (list, np.ndarray))
-            }
-            _names[state].texts = texts_about(items)
-        else:
-            found = {}
-        names = _names[state]
-        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), found | names.cells)
+        yield _Opened(names, lambda name: _shown(file, file[names[name]], path), dict(names.cells))
+
+
+@cached_by_file(1)
+def _names_in(path: Path) -> ByName[str]:
+    """Returns the arrays in an HDF5 file by name, and where in it they lie."""
+    with _hdf5_of_others(path) as file:
+        items = dict(_datasets(file, path))
+        shown = {name: _shown(file, item, path) for name, item in items.items()}
+        found = {name: array for name, array in shown.items() if array is not None}
+        names = ByName({name: items[name].name for name in found})
+        names.cells = {name: array for name, array in found.items() if isinstance(array, (list, np.ndarray))}
+        names.texts = texts_about(items)
+        return names
 
 
 class _Opened(Mapping[str, Any]):
@@ -401,14 +399,9 @@ def _cells(file: h5py.File, item: h5py.Dataset, path: Path) -> np.ndarray | list
     return joined([np.zeros((0, 0)) if one.attrs.get("MATLAB_empty") else _checked(one, path)[()].T for one in inside])
 
 
+@cached_by_file(1)  # an array holds many sequences; each process reads it once
 def _read_all(path: Path) -> Mapping[str, Array | list[np.ndarray]]:
     """Returns the arrays of a file that is no HDF5."""
-    facts = path.stat()
-    return _read_once(path, facts.st_size, facts.st_mtime_ns)
-
-
-@lru_cache(maxsize=1)  # an array holds many sequences; each process reads it once
-def _read_once(path: Path, _size: int, _changed: int) -> Mapping[str, Array | list[np.ndarray]]:
     if path.suffix.lower() == ".npy":
         return {"": _npy(path)}
     if path.suffix.lower() == ".mat":

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.file_cache import cached_by_file
 from dpcli.prepare.array_files.attributes import attributes_of, told_units
 from dpcli.prepare.array_files.axes import axes_of, choices
 from dpcli.prepare.array_files.choosing import (
@@ -177,8 +177,7 @@ def stored_sequence(path: Path, arrays: Mapping[str, Any], source: Source, asked
                 " sequence, give --axes TNC, if each is a sample of its own, save it to a file in a folder of its own"
             )
         return StoredSequence(path, arrays, source, "", beside)
-    facts = path.stat()
-    axes = asked or _axes(path, source.keys[0], facts.st_size, facts.st_mtime_ns)
+    axes = asked or _axes(path, source.keys[0])
     if not axes:
         raise DataError(_which(path, array.shape))
     beside = find_beside(arrays, source.keys[0], axes)
@@ -191,8 +190,8 @@ def stored_sequence(path: Path, arrays: Mapping[str, Any], source: Source, asked
     return StoredSequence(path, arrays, source, axes, beside)
 
 
-@lru_cache(maxsize=64)  # an array holds many sequences; each process looks at it once
-def _axes(path: Path, key: str, _size: int, _changed: int) -> str:
+@cached_by_file(64)  # an array holds many sequences; each process looks at it once
+def _axes(path: Path, key: str) -> str:
     with open_arrays(path) as arrays:
         return axes_of(arrays[key])
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.file_cache import cached_by_file
 from dpcli.prepare.articulated.articulated_object import triangle_areas
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
 from dpcli.prepare.decode.folder_listing import files_below
@@ -26,7 +26,7 @@ class Shape:
     hull: np.ndarray
 
 
-@lru_cache(maxsize=4)
+@cached_by_file(4)
 def find_meshes(folder: Path) -> tuple[str, ...]:
     """Returns mesh files below a folder, relative to it, in natural order. Raises DataError when there are none."""
     require_folder(folder, f"meshes in it or below ({' '.join(MESH_FORMATS)})")
@@ -36,7 +36,7 @@ def find_meshes(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(found, key=natural_key))
 
 
-@lru_cache(maxsize=24)
+@cached_by_file(24)
 def load_shape(path: Path, up: str) -> Shape:
     """Reads a mesh file as a Shape; ``up``: the axis (y or z) that points up in it.
 

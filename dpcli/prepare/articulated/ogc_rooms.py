@@ -15,7 +15,7 @@ from dpcli.prepare.articulated.articulated_object import triangle_areas
 from dpcli.prepare.articulated.object_splits import SplitRule, counts_of_splits
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
 from dpcli.prepare.articulated.ogc_meshes import Shape, find_meshes, load_shape
-from dpcli.prepare.meshes.raycast import pixel_rays
+from dpcli.prepare.meshes.raycast import world_rays
 from dpcli.prepare.meshes.surface_points import (
     SurfacePoints,
     choose_on_surface,
@@ -151,7 +151,7 @@ def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
     width, height = _PICTURE
     focal = height / 2 / half
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    rays = pixel_rays(intrinsics, pose, slice(0, height), slice(0, width), 1).reshape(-1, 6)
+    rays = world_rays(intrinsics, pose, slice(0, height), slice(0, width), 1).reshape(-1, 6)
     seen = first_hits(raycasting_scene(triangles), rays)
     if not len(seen.triangle):
         raise DataError("the camera sees nothing of the room's objects; their surfaces are too thin")

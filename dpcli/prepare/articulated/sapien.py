@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Hashable
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
+from dpcli.file_cache import cached_by_file, file_state
 from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_object import nothing_moves
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
@@ -90,9 +92,12 @@ def _model_category(meta: Path) -> str:
     return category.strip() if isinstance(category, str) else ""
 
 
-@lru_cache(maxsize=3)
-def _studied(path: Path, root: Path | None, options: Articulation) -> Study:
-    """Studies an object; its meshes are read once for all its sequences, and a process keeps the last few objects."""
+@cached_by_file(3)
+def _studied(path: Path, root: Path | None, options: Articulation, meshes: tuple[Hashable, ...]) -> Study:
+    """Studies an object; its meshes are read once for all its sequences, and a process keeps the last few objects.
+
+    meshes: the states of their files, since the object is another one when they change, too.
+    """
     return study(load_object(read_skeleton(path, root)), options)
 
 
@@ -154,7 +159,8 @@ class Sapien(Reader):
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        studied = _studied(item.path, self.root, self.articulation)
+        meshes = tuple(map(file_state, item.extra["files"]))
+        studied = _studied(item.path, self.root, self.articulation, meshes)
         if not item.extra["first"]:  # what is odd in an object counts once, not once a sequence
             studied = replace(studied, notes=Counter())
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))

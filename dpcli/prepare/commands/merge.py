@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import short_names
-from dpcli.prepare.commands.copy_samples import Copy, copy_samples
-from dpcli.prepare.commands.sources import OpenFiles, Source, read_source
+from dpcli.prepare.commands.copy_samples import copy_samples
+from dpcli.prepare.commands.sources import open_source, warn_of_others
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Report, count_samples
+from dpcli.runtime.machines.shards import shard_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.file import file_kind
 from dpcli.store.pipes import refuse_repeats
+from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import already_made
-from dpcli.store.writing.join_shards import join_shards
+from dpcli.store.writing.join_shards import is_shard, join_shards
+from dpcli.store.writing.open_readers import OpenReaders
+
+_OPEN = 64  # files held open at a time
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Holds a file to be joined, and what goes before its samples' names in the joined file."""
+
+    reader: CloudsReader
+    prefix: str
+
+    def sample_name(self, index: int) -> str:
+        """Returns the sample's name in the joined file."""
+        return self.prefix + self.reader.names[index]
 
 
 def merge(
@@ -41,114 +58,121 @@ def merge(
     a stop signal.
     """
     refuse_repeats([*inputs, output])
-    if labels is None and not prefix and (_no_clouds(inputs) or all(read_source(path).shard for path in inputs)):
+    may_be_shards = labels is None and not prefix
+    if may_be_shards and any(file_kind(path) != "clouds" for path in inputs):
         return _merge_shards(inputs, output, force, resume)
-    sources = [read_source(path) for path in inputs]
-    for source in sources:
-        source.warn_of_others()
-        if source.shard:
-            log.warn(
-                f"{source.path}: is shard {source.shard} of a conversion; joined as any other file, in its own order"
-            )
-    if prefix:
-        for source, name in zip(sources, short_names(inputs)):
-            source.prefix = f"{name}/"
+    readers = [open_source(path) for path in inputs]
+    if may_be_shards and all(map(is_shard, readers)):
+        return _merge_shards(inputs, output, force, resume)
+    for reader in readers:
+        warn_of_others(reader)
+        if is_shard(reader):
+            shard = shard_of(reader.provenance[-1])[0]
+            log.warn(f"{reader.path}: is shard {shard} of a conversion; joined as any other file, in its own order")
+    prefixes = [f"{name}/" for name in short_names(inputs)] if prefix else [""] * len(readers)
+    sources = [_Source(*both) for both in zip(readers, prefixes)]
     return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
 
 
-def _no_clouds(inputs: Sequence[Path]) -> bool:
-    return any(file_kind(path) != "clouds" for path in inputs)
-
-
 def _merge_shards(inputs: Sequence[Path], output: Path, force: bool, resume: bool) -> Report:
-    there = output.exists() and not force
-    join_shards(inputs, output, force=force, resume=resume)
-    return count_samples(Report(was_complete=there), output)
+    report = Report(was_complete=output.exists() and not force)
+    joined = join_shards(inputs, output, force=force, resume=resume)
+    if isinstance(joined, CloudsReader):  # or one of parts
+        return count_samples(report, joined)
+    report.written, report.skipped = len(joined.names), joined.skipped
+    return report
 
 
 def _merge_unlike(
-    sources: list[Source], output: Path, labels: LabelMap, compression: str, force: bool, resume: bool
+    sources: list[_Source], output: Path, labels: LabelMap, compression: str, force: bool, resume: bool
 ) -> Report:
-    units = {source.length_unit: source.path for source in sources}
-    if len(units) > 1:
-        (a, one), (b, two), *_ = units.items()
-        raise DataError(f"{two}: its length unit is {b!r}, of {one} it is {a!r}; convert to one unit (--scale) first")
-    class_names, tables = labels.resolve([(source.path, source.class_names) for source in sources])
-    fields = tuple(name for name in sources[0].fields if all(name in source.fields for source in sources))
-    for name in sorted({name for source in sources for name in source.fields} - set(fields)):
-        log.warn(f"{name}: left out, not all of the files have it")
+    readers = [source.reader for source in sources]
+    length_unit = _common_unit(readers)
+    class_names, tables = labels.resolve([(reader.path, reader.class_names) for reader in readers])
+    fields = _common_fields(readers)
     _refuse_equal_names(sources)
-    chosen: list[tuple[Source, int, int | None]] = []
+    chosen: list[tuple[_Source, int, int]] = []  # file, place in it, label in the joined file
     skipped: list[tuple[str, str]] = []
     for source, table in zip(sources, tables):
-        skipped += [(source.prefix + name, why) for name, why in source.skipped]
-        for index, label in enumerate(source.labels):
-            if label >= 0 and table[label] is None:
-                why = f"class {source.class_names[label]!r} is left out by the label map"
+        skipped += [(source.prefix + name, why) for name, why in source.reader.skipped]
+        for index, label in enumerate(source.reader.labels.tolist()):
+            joined = table[label] if label >= 0 else -1
+            if joined is None:
+                why = f"class {source.reader.class_names[label]!r} is left out by the label map"
                 skipped.append((source.sample_name(index), why))
             else:
-                chosen.append((source, index, table[label] if label >= 0 else -1))
+                chosen.append((source, index, joined))
     config = {
-        "merge": [source.path.name for source in sources],
+        "merge": [reader.path.name for reader in readers],
         "labels": asdict(labels),
         "prefix": any(source.prefix for source in sources),
         "compression": compression,
-        "sources": [source.provenance for source in sources],
+        "sources": [reader.provenance for reader in readers],
     }
-    entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
-    unit = sources[0].length_unit
-    pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
-    pattern.parts = max(source.parts for source in sources)
-    copy = Copy(
-        output=output,
-        pattern=pattern,
-        names=[source.sample_name(index) for source, index, _ in chosen],
-        provenance=entry,
-        task="prepare merge",
-        skipped=skipped,
-        compression=compression,
-        force=force,
-        resume=resume,
-    )
-    return _write_samples(copy, chosen)
+    entry = record(config, 0, {f"{k}": reader.path for k, reader in enumerate(readers)})
+    if not force and already_made(output, entry, CloudsReader):
+        return count_samples(Report(was_complete=True), CloudsReader(output))
+    parts = max(map(_count_parts, readers))
+
+    def read(place: int) -> CloudSequence:
+        source, index, label = chosen[place]
+        sequence = opened.use(source.reader).read(index)
+        sequence.name, sequence.label = source.prefix + sequence.name, label
+        for name in set(source.reader.fields) - set(fields):
+            sequence.without(name)
+        sequence.pad_parts(parts)
+        return sequence
+
+    with OpenReaders(_OPEN) as opened:
+        copy_samples(
+            output,
+            [source.sample_name(index) for source, index, _ in chosen],
+            read,
+            task="prepare merge",
+            skipped=skipped,
+            source="merge",
+            provenance=entry,
+            compression=compression,
+            force=force,
+            resume=resume,
+            class_names=class_names,
+            length_unit=length_unit,
+            fields=fields,
+        )
+    return count_samples(Report(), CloudsReader(output))
 
 
-def _refuse_equal_names(sources: list[Source]) -> None:
+def _common_unit(readers: list[CloudsReader]) -> str:
+    """Returns the unit of length of all files. Raises DataError where they have several."""
+    units = {reader.length_unit: reader.path for reader in readers}
+    if len(units) > 1:
+        (a, one), (b, two), *_ = units.items()
+        raise DataError(f"{two}: its length unit is {b!r}, of {one} it is {a!r}; convert to one unit (--scale) first")
+    return readers[0].length_unit
+
+
+def _common_fields(readers: list[CloudsReader]) -> tuple[str, ...]:
+    """Returns the optional fields that all files have, and warns of those that only some have."""
+    fields = tuple(name for name in readers[0].fields if all(name in reader.fields for reader in readers))
+    for name in sorted({name for reader in readers for name in reader.fields} - set(fields)):
+        log.warn(f"{name}: left out, not all of the files have it")
+    return fields
+
+
+def _count_parts(reader: CloudsReader) -> int:
+    """Returns how many parts the poses and joints of a file have, 0 where it has none."""
+    with reader:
+        return max((reader.file[key].shape[1] for key in OF_PARTS.keys() & set(reader.fields)), default=0)
+
+
+def _refuse_equal_names(sources: list[_Source]) -> None:
     seen: dict[str, Path] = {}
     for source in sources:
-        for index in range(len(source.names)):
+        for index in range(len(source.reader)):
             own = source.sample_name(index)
             if own in seen:
                 advice = "files and folders of one name" if source.prefix else "--prefix puts the file's name before it"
                 raise DataError(
-                    f"{source.path}: sample {own!r} is in {seen[own]} as well; names identify samples ({advice})"
+                    f"{source.reader.path}: sample {own!r} is in {seen[own]} as well; names identify samples ({advice})"
                 )
-            seen[own] = source.path
-
-
-def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) -> Report:
-    """Copies (file, index, new label or None for its own), or leaves a file as it is that was made of the same."""
-    if not copy.force and already_made(copy.output, copy.provenance, CloudsReader):
-        return count_samples(Report(was_complete=True), copy.output)
-    files = OpenFiles()
-
-    def read(place: int) -> CloudSequence:
-        source, index, label = samples[place]
-        return _relabel(files.read(source.path, index), source, copy.pattern, label)
-
-    try:
-        copy_samples(copy, read)
-    finally:
-        files.close()
-    return count_samples(Report(), copy.output)
-
-
-def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
-    """Returns the sample as the joined file has it: its label, its name, as many parts, and no field that others lack."""
-    if label is not None:
-        sequence.label = label
-    sequence.name = source.prefix + sequence.name
-    for name in set(source.fields) - set(pattern.fields):
-        sequence.without(name)
-    sequence.pad_parts(pattern.parts)
-    return sequence
+            seen[own] = source.reader.path

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.commands.copy_samples import Copy, copy_samples
-from dpcli.prepare.commands.sources import Source, read_source
+from dpcli.prepare.commands.copy_samples import copy_samples
+from dpcli.prepare.commands.sources import open_source, warn_of_others
 from dpcli.prepare.name_tables import places_of, read_rows, warn_of_splits
 from dpcli.prepare.reader import SPLITS, split_called
 from dpcli.runtime.provenance import record
@@ -49,30 +49,31 @@ class SplitChoice:
             if not (low >= 0 and abs(total - 1) <= 1e-6):  # NaN, too
                 raise UsageError(f"--fractions {self.fractions}: expected three numbers from 0 that sum to 1")
 
-    def assign(self, source: Source, splits: Sequence[str], subjects: Sequence[int]) -> list[str]:
+    def assign(self, source: CloudsReader) -> list[str]:
         """Returns the split of each sample, "" for those that go nowhere.
 
         Raises DataError when the file lacks what is asked for.
         """
+        splits, subjects = source.splits, source.subjects.tolist()
         if self.listed is not None:
             return splits_by_list(source, self.listed)
         if self.subjects is not None:
-            return splits_by_subject(source, subjects, self.subjects)
+            return splits_by_subject(source, self.subjects)
         if self.fractions is not None:
             if self.by_subject and min(subjects) < 0:
                 raise DataError(
                     f"{source.path}: --by-subject: subjects are not known of all samples; `dpc prepare ... --labels FILE.csv`"
                     " takes them from a column subject"
                 )
-            groups = list(subjects) if self.by_subject else list(range(len(splits)))
-            strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
+            groups = subjects if self.by_subject else list(range(len(splits)))
+            strata = source.labels.tolist() if self.stratify and not self.by_subject else [0] * len(splits)
             return draw_splits(groups, strata, self.fractions, self.seed)
         if not any(splits):
             raise DataError(f"{source.path}: has no splits; choose --list, --train-subjects or --fractions")
         return list(splits)
 
 
-def splits_by_list(source: Source, path: Path) -> list[str]:
+def splits_by_list(source: CloudsReader, path: Path) -> list[str]:
     """Returns splits from a table of name,split as `read_rows` reads it, with or without that header, those of ours in any
     spelling. Raises DataError for names of samples that are not there.
     """
@@ -83,7 +84,7 @@ def splits_by_list(source: Source, path: Path) -> list[str]:
     return [chosen.get(name, "") for name in source.names]
 
 
-def splits_by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
+def splits_by_subject(source: CloudsReader, wanted: dict[str, tuple[int, ...]]) -> list[str]:
     """Returns the named subjects' splits, test for the others.
 
     Raises DataError for an unknown subject, UsageError for two splits.
@@ -93,6 +94,7 @@ def splits_by_subject(source: Source, subjects: Sequence[int], wanted: dict[str,
         for number in numbers:
             if where.setdefault(number, split) != split:
                 raise UsageError(f"subject {number} is to be {where[number]} and {split}")
+    subjects = source.subjects.tolist()
     absent = sorted(set(where) - set(subjects))
     if absent or -1 in subjects:
         found = ",".join(map(str, sorted(set(subjects) - {-1}))) or "none"
@@ -134,24 +136,21 @@ def split(
     -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams;
     stopped or killed, it goes on from the last sample when run again.
     """
-    source = read_source(path)
-    source.warn_of_others()
-    with CloudsReader(path) as reader:
-        splits = choice.assign(source, reader.splits, reader.subjects.tolist())
+    with open_source(path) as source:
+        warn_of_others(source)
+        splits = choice.assign(source)
         counts = {name: splits.count(name) for name in dict.fromkeys((*SPLITS, *splits)) if name in splits}
         said = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(choice).items()}
         inputs = {"clouds": path, **({"list": choice.listed} if choice.listed else {})}
         entry = record({"split": said, "compression": compression}, choice.seed, inputs)
         if output.suffix.lower() in (".h5", ".hdf5"):
             wanted = [name for name in counts if name]
-            _write_split(reader, splits, wanted, _plan_copy(source, output, entry, compression, force))
+            _write_split(source, splits, wanted, output, entry, compression, force)
             return counts
         make_folder(output)
-        for name in counts:
-            if name:
-                part = {**entry, "config": {**entry["config"], "part": name}}
-                copy = _plan_copy(source, output / f"{_file_name(name)}.h5", part, compression, force)
-                _write_split(reader, splits, [name], copy)
+        for name in filter(None, counts):
+            part = {**entry, "config": {**entry["config"], "part": name}}
+            _write_split(source, splits, [name], output / f"{_file_name(name)}.h5", part, compression, force)
     return counts
 
 
@@ -161,30 +160,40 @@ def _file_name(split_name: str) -> str:
     return split_name
 
 
-def _plan_copy(source: Source, output: Path, entry: dict[str, Any], compression: str, force: bool) -> Copy:
-    return Copy(
-        output=output,
-        pattern=source,
-        names=[],
-        provenance=[*source.provenance, entry],
-        task=f"prepare split {output.stem}",
-        skipped=source.skipped,
-        compression=compression,
-        force=force,
-        where=f" of {output}",
-    )
-
-
-def _write_split(reader: CloudsReader, splits: list[str], wanted: list[str], copy: Copy) -> None:
-    """Copies the samples of the wanted splits, or leaves a file as it is that was made the same way."""
-    check_output(copy.output, "-o", [copy.pattern.path])
-    if not copy.force and already_made(copy.output, copy.provenance[-1], CloudsReader):
+def _write_split(
+    source: CloudsReader,
+    splits: list[str],
+    wanted: list[str],
+    output: Path,
+    entry: dict[str, Any],
+    compression: str,
+    force: bool,
+) -> None:
+    """Copies the samples of the wanted splits, or leaves a file as it is that was made the same way: `entry` says how."""
+    check_output(output, "-o", [source.path])
+    if not force and already_made(output, entry, CloudsReader):
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]
 
     def read(place: int) -> CloudSequence:
-        sequence = reader.read(chosen[place])
+        sequence = source.read(chosen[place])
         sequence.split = splits[chosen[place]]
         return sequence
 
-    copy_samples(replace(copy, names=[reader.names[index] for index in chosen]), read)
+    copy_samples(
+        output,
+        [source.names[index] for index in chosen],
+        read,
+        task=f"prepare split {output.stem}",
+        skipped=source.skipped,
+        where=f" of {output}",
+        provenance=[*source.provenance, entry],
+        compression=compression,
+        force=force,
+        resume=True,
+        class_names=source.class_names,
+        length_unit=source.length_unit,
+        source=str(source.attributes.get("source", "")),
+        seed=int(source.attributes.get("seed", 0)),
+        fields=source.fields,
+    )

@@ -18,7 +18,7 @@ from dpcli.prepare.cloud_formats.text_cloud import read_text, read_vertices
 from dpcli.prepare.decode.e57_files import read_e57
 from dpcli.runtime.clips.other_files import stand_ins_named
 
-_READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
+_CLOUDS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".ply": read_ply,
     ".pcd": read_pcd,
     ".las": read_las,
@@ -45,7 +45,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
 }
 MESHES = (".obj", ".off")  # whose vertices are read where there is nothing else
 HDF5 = (".h5", ".hdf5")  # which are read where there is nothing else: what dpc makes may lie beside the clouds
-SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
+SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_CLOUDS)[4:])
+_READERS = {**_CLOUDS, **dict.fromkeys(MESHES, read_vertices), **dict.fromkeys(HDF5, read_mat)}
 
 
 def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] = ()) -> Cloud:
@@ -58,10 +59,6 @@ def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] =
         raise DataError(f"{path}: the file is empty")
     suffix = path.suffix.lower()
     with stand_ins_named(path):
-        if suffix in MESHES:
-            return read_vertices(path, keep)
-        if suffix in HDF5:
-            return read_mat(path, keep)
         if suffix != ".bin":
             return _READERS[suffix](path, keep)
         if keep:

@@ -52,7 +52,7 @@ class FrameCaster:
         rows, columns = self._window(intrinsics, world_to_camera, size)
         if rows.start >= rows.stop or columns.start >= columns.stop:
             return image
-        rays = pixel_rays(intrinsics, world_to_camera, rows, columns, samples)
+        rays = world_rays(intrinsics, world_to_camera, rows, columns, samples)
         seen = self._look(rays.reshape(-1, 6))
         shape = (rows.stop - rows.start, samples, columns.stop - columns.start, samples, 4)
         total = seen.reshape(shape).sum((1, 3))  # premultiplied
@@ -149,7 +149,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)).astype(np.float32)
 
 
-def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:
+def world_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:
     """Returns rays f32 (rows, samples, columns, samples, 6): origin and unit direction, pixel centers at +0.5."""
     y = np.arange(rows.start * samples, rows.stop * samples).reshape(-1, samples)
     x = np.arange(columns.start * samples, columns.stop * samples).reshape(-1, samples)

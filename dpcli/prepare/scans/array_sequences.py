@@ -36,7 +36,7 @@ from dpcli.prepare.cloud_formats.column_names import first_unit, note_of_units
 from dpcli.prepare.decode.folder_listing import files_below, named_below, walk_folders
 from dpcli.prepare.labels import LabelTable, Row
 from dpcli.prepare.reader import Item, Sample, natural_key
-from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.cloud_series import left_out_below
 from dpcli.prepare.scans.tracked_points import identify, with_track
 from dpcli.prepare.series import TEXTS, is_beside, is_hidden, missing_numbers
@@ -225,9 +225,8 @@ class ArraySequences(OwnScans):
         for cloud, own in zip(clouds, real):
             cloud.keep(own)
         time = None if time is None else time[kept]
-        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.note({MORE_FRAMES: more, **note_of_units(["points"], {"points": units}), UNCOUNTED: dropped})
-        return sample
+        notes = {MORE_FRAMES: more, **note_of_units(["points"], {"points": units}), UNCOUNTED: dropped}
+        return self._assembled(item, clouds, time, notes)
 
     def _column(self, stored: StoredSequence, name: str) -> np.ndarray:
         is_track = name == self.track

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -126,6 +126,12 @@ class OwnScans(Reader):
     def config(self) -> dict[str, Any]:
         left_out = ("raw", "labels", *(() if self.track else ("track",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
+
+    def _assembled(self, item: Item, clouds: list[Cloud], time: np.ndarray | None, notes: Mapping[str, int]) -> Sample:
+        """Returns the sample of frames that were read, in their order, with what was noted while they were."""
+        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+        sample.note(notes)
+        return sample
 
 
 def assemble(

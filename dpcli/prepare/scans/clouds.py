@@ -17,7 +17,7 @@ from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.reader import Item, Sample, require_folder
-from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.cloud_series import find_sequences, refuse_file
 from dpcli.prepare.scans.tables import TABLES, open_table
 from dpcli.prepare.scans.times_of_tables import times_like_frames
@@ -133,9 +133,7 @@ class CloudFolders(OwnScans):
         if item.extra["color"]:
             _require_colors(paths, clouds)
         time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
-        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.note(notes)
-        return sample
+        return self._assembled(item, clouds, time, notes)
 
     def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:
         """Returns how many columns the ``.bin`` frames of one sequence have, and a note where that had to be guessed."""

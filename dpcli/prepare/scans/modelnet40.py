@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,6 +11,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.file_cache import cached_by_file
 from dpcli.path_names import first_names
 from dpcli.prepare.array_files.containers import own_data_set
 from dpcli.prepare.reader import Item, Reader, Sample, describe, natural_key, published_found, require_folder
@@ -34,7 +34,7 @@ def _read_array(path: Path, name: str) -> np.ndarray:
         return own_data_set(file, name, path)[()]
 
 
-@lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
+@cached_by_file(1)  # 50 MB; its 2,048 shapes are read one after the other
 def _clouds(path: Path) -> np.ndarray:
     data = _read_array(path, "data")
     if data.ndim != 3 or data.shape[2] != 3 or data.dtype.kind != "f":

@@ -16,7 +16,7 @@ from dpcli.prepare.reader import Item, Sample
 from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
 from dpcli.prepare.recordings.recording import find_recordings, open_recording, unread_recordings
 from dpcli.prepare.recordings.topic_frames import read_topic
-from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.tracked_points import identify, with_track
 
 _WANTED = "clouds (PointCloud2, CustomMsg of Livox, PointCloud of Foxglove)"
@@ -84,9 +84,7 @@ class RecordedClouds(OwnScans):
         time = np.arange(len(clouds)) * self.stride / self.fps if self.fps else read.time
         if time is None:
             raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")
-        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
-        sample.note(read.notes)
-        return sample
+        return self._assembled(item, clouds, time, read.notes)
 
     def summary(self, items: list[Item]) -> list[str]:
         unread = f"; not read: {first_names(self._first[1], _LISTED)} (--keep-fields)" if self._first[1] else ""

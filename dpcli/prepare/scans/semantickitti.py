@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.file_cache import cached_by_file
 from dpcli.path_names import first_names
 from dpcli.prepare.reader import Item, Reader, Sample, describe, require_folder, require_known, require_least
 from dpcli.prepare.scans.kitti_files import (
@@ -66,7 +66,7 @@ def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     return label & 0xFFFF, label
 
 
-@lru_cache(maxsize=4)
+@cached_by_file(4)
 def read_poses(path: Path) -> np.ndarray:
     """Reads poses.txt as f64 (scans,4,4): camera of each scan to the camera of scan 0."""
     try:
@@ -86,6 +86,19 @@ def read_poses(path: Path) -> np.ndarray:
 
 def _labels_without_scan(folder: Path) -> list[str]:
     return sorted(set(names_in(folder / "labels", ".label")) - set(names_in(folder / "velodyne", ".bin")))
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Holds the points of one scan in camera axes, f64 (M,3), and their objects, i64 (M), 0 = background.
+
+    ``dropped`` counts the points outside the view; ``strange``: there are classes that SemanticKITTI doesn't have.
+    """
+
+    points: np.ndarray
+    objects: np.ndarray
+    dropped: int
+    strange: bool
 
 
 @dataclass(frozen=True)
@@ -162,37 +175,31 @@ class SemanticKitti(Reader):
         to_camera, projection = (calibration_matrix(found, path, key) for key in ("Tr", "P2"))
         whole = is_no_camera(projection)
         kept = [self._scan(item.path, name, to_camera, None if whole else projection) for name in item.extra["scans"]]
-        notes = {_WHOLE: len(kept)} if whole else {OUTSIDE: sum(dropped for _, _, dropped, _ in kept)}
-        notes[_REMAPPED] = sum(strange for _, _, _, strange in kept)
+        notes = {_WHOLE: len(kept)} if whole else {OUTSIDE: sum(scan.dropped for scan in kept)}
+        notes[_REMAPPED] = sum(scan.strange for scan in kept)
         motions = self._alignment(item)
-        moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _, _), m in zip(kept, motions, strict=True)]
+        moved = [scan.points @ m[:3, :3].T + m[:3, 3] for scan, m in zip(kept, motions, strict=True)]
         ahead = whole and to_camera[2, 0] < 0.5  # x of the scanner stays x, as by a Tr that moves nothing
         clouds = [orient_points(to_camera_axes(points) if ahead else points, self.coordinates) for points in moved]
-        sizes = np.cumsum([len(ids) for _, ids, _, _ in kept])[:-1]
+        sizes = np.cumsum([len(scan.objects) for scan in kept])[:-1]
         # over all frames: an object keeps its number
-        part = renumber_objects(np.concatenate([ids for _, ids, _, _ in kept]))
+        part = renumber_objects(np.concatenate([scan.objects for scan in kept]))
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
         notes["samples without an object"] = int(not part.any())
         return Sample(sequence, notes)
 
-    def _scan(
-        self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, int, bool]:
-        """Returns points in camera axes f64 (M,3), object ids i64 (M), 0 = background, how many points were dropped, and whether
-        there are classes that SemanticKITTI doesn't have.
-
-        Without a projection all points are kept, where ``to_camera`` puts them.
-        """
+    def _scan(self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray | None) -> _Scan:
+        """Reads a scan; without a projection all points are kept, where ``to_camera`` puts them."""
         scan = read_velodyne(folder / "velodyne" / f"{name}.bin")
         semantic, label = read_labels(folder / "labels" / f"{name}.label", len(scan))
         strange = not _KNOWN[semantic].all()
         label[~np.isin(semantic, [number for kind in self.objects for number in CLASSES[kind]])] = 0
         if projection is None:
-            return scan.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3], label, 0, strange
+            return _Scan(scan.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3], label, 0, strange)
         points, index = self.view.crop(scan, to_camera, projection, IMAGE_SIZE)
-        return points, label[index], len(scan) - len(index), strange
+        return _Scan(points, label[index], len(scan) - len(index), strange)
 
     def _alignment(self, item: Item) -> np.ndarray:
         """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities

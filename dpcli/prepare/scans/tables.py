@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.counted import counted
 from dpcli.errors import DataError, UsageError
+from dpcli.file_cache import cached_by_file
 from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.array_files.containers import SUFFIXES, made_by_dpc
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
@@ -28,7 +29,7 @@ from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 from dpcli.prepare.decode.folder_listing import named_below, walk_folders
 from dpcli.prepare.named_columns import ArrayTable
 from dpcli.prepare.reader import Item, Sample, natural_key
-from dpcli.prepare.scans.assembling import Lengths, OwnScans, assemble
+from dpcli.prepare.scans.assembling import OwnScans
 from dpcli.prepare.scans.cloud_series import left_out_below, refuse_file
 from dpcli.prepare.scans.frames_of_tables import JOINED, SILENT, SINGLE, Rows, frame_column, split_rows
 from dpcli.prepare.scans.times_of_tables import Clock, find_clocks
@@ -99,7 +100,7 @@ class TableSequences(OwnScans):
         """Returns whether the frames of the first good table have times, and whether it has colors."""
         for path in self._paths.values():
             try:
-                loaded = self._load(path)
+                loaded = _load(path, self)
             except DataError:
                 continue  # a bad sample: the next one tells
             timed = all(loaded.times(part, self.fps) is not None for part in loaded.parts)
@@ -115,7 +116,7 @@ class TableSequences(OwnScans):
         time, color = self._first
         for name, path in self._paths.items():
             try:
-                parts = self._load(path).parts
+                parts = _load(path, self).parts
             except DataError as error:
                 items.append(Item(name, path, problem=str(error)))
                 continue
@@ -128,12 +129,8 @@ class TableSequences(OwnScans):
     def items(self) -> list[Item]:
         return self._table.apply(self._items)
 
-    def _load(self, path: Path) -> Loaded:
-        facts = path.stat()
-        return _load(self, path, facts.st_size, facts.st_mtime_ns)
-
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        loaded = self._load(item.path)
+        loaded = _load(item.path, self)
         part = loaded.parts[item.extra["part"]]
         if item.extra["color"] and loaded.cloud.color is None:
             raise DataError(f"{item.path}: no colors, though the first table of all has them")
@@ -147,9 +144,9 @@ class TableSequences(OwnScans):
         if item.extra["part"]:  # the first sequence told the table's
             dropped = {what: count for what, count in dropped.items() if what != EMPTY}
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
-        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         silent = 0 if time is not None or part.joined else part.silent
-        sample.note({**dropped, **{note: 1 for note in part.notes}, JOINED: part.joined, SILENT: silent})
+        notes = {**dropped, **dict.fromkeys(part.notes, 1), JOINED: part.joined, SILENT: silent}
+        sample = self._assembled(item, clouds, time, notes)
         mixed = next((name for name in loaded.recordings if loaded.mixes(part, name)), None)
         if mixed:
             sample.note({MIXED.format(mixed): 1})
@@ -165,7 +162,7 @@ class TableSequences(OwnScans):
         lines = [f"{counted(len(items), 'sequence')} in {counted(tables, 'table')}"]
         good = next((item for item in items if not item.problem), None)
         if good:
-            loaded = self._load(good.path)
+            loaded = _load(good.path, self)
             first = loaded.parts[0]
             used = self._first[0] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
             clock = used.columns if used else ()
@@ -226,9 +223,9 @@ class Loaded:
         return found
 
 
-@lru_cache(maxsize=2)  # a table holds many sequences; each process reads it once
-def _load(reader: TableSequences, path: Path, size: int, _changed: int) -> Loaded:
-    if not size:
+@cached_by_file(2)  # a table holds many sequences; each process reads it once
+def _load(path: Path, reader: TableSequences) -> Loaded:
+    if not path.stat().st_size:
         raise DataError(f"{path}: the file is empty")
     in_columns = reader.track == COLUMNS
     try:

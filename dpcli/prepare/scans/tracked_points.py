@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -142,6 +143,11 @@ class TrackedViews(OwnScans):
         """Returns the unit that the options name, where one of them is given; else the views file's, "" where it tells none."""
         with ViewsReader(self.raw) as views:
             return self.unit if self.unit != "m" or self.scale is not None else views.header.length_unit
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        with ViewsReader(self.raw) as views:
+            return views.provenance
 
     def items(self) -> list[Item]:
         """Returns the one sample, named as the views are. Raises DataError where they have no tracks."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +35,8 @@ def transforms_config(path: Path, options: VideoOptions, *, quiet: bool = True) 
     """Returns options and digests of everything read, for provenance; quiet: what is left out isn't told."""
     _check(options)
     views, times = read_views(path, quiet=quiet)
-    config = {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in asdict(options).items()
-        if key != "pattern"
-    }
     pictures = (view.paths[time] for view in views for time in times)
-    config["input_digest"] = digest_of([*transforms_files(path), *pictures])
+    config = {**options.config, "input_digest": digest_of([*transforms_files(path), *pictures])}
     masks = [view.masks[time] for view in views for time in times if time in view.masks]
     return {**config, "mask_digest": digest_of(masks)} if masks else config
 

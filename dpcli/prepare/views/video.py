@@ -94,6 +94,12 @@ class VideoOptions:
         """Returns whether the clip is cropped around the object; beside other views it isn't, since a crop moves the camera."""
         return self.recenter and self.views is None
 
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options for provenance: paths as they were typed, and no pattern where none was."""
+        typed = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(self).items()}
+        return {key: value for key, value in typed.items() if value or key != "pattern"}
+
     def camera(self) -> OrbitCamera:
         """Returns the reference camera: azimuth 0."""
         return OrbitCamera(0.0, float(np.deg2rad(self.elevation)), self.radius, float(np.deg2rad(self.fovy)))
@@ -143,9 +149,7 @@ def clip_name(path: Path) -> str:
 
 def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     """Returns options and digests of everything read, for provenance: equal configurations give equal files."""
-    config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
-    if not options.pattern:
-        del config["pattern"]
+    config = options.config
     frames = open_frames(path, options.pattern, quiet=True)
     config["input_digest"] = digest_of(frames.files)
     if path.is_dir() and frames.times is not None and options.fps is None:  # those of a video are in its bytes

@@ -26,7 +26,7 @@ from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
 from dpcli.prepare.meshes.animation import load_animation
 from dpcli.prepare.meshes.filming import OBJECT_RADIUS
 from dpcli.prepare.meshes.layered_views import split_hits
-from dpcli.prepare.meshes.raycast import FrameCaster, pixel_rays
+from dpcli.prepare.meshes.raycast import FrameCaster, world_rays
 
 CLIPS = (
     "animals_pack/Fox.glb:Walk,animals_pack/Fox.glb:Gallop,animals_pack/Cow.glb:Walk,animals_pack/Cow.glb:Gallop,"
@@ -74,7 +74,7 @@ def draw_points(points: np.ndarray, colors: np.ndarray, camera: Camera, size: in
 def true_layers(caster: FrameCaster, camera: Camera, picture: np.ndarray) -> ShapeLayers:
     """Returns the layers of the mesh itself behind a picture (4,H,W), each with its true color."""
     height, width = picture.shape[1:]
-    rays = pixel_rays(camera.intrinsics, camera.world_to_camera, slice(0, height), slice(0, width), 1).reshape(-1, 6)
+    rays = world_rays(camera.intrinsics, camera.world_to_camera, slice(0, height), slice(0, width), 1).reshape(-1, 6)
     ray, hit, triangle, weights = caster.all_hits(rays)
     a, b, c = (caster.positions[caster.mesh.triangles[triangle, k]] for k in range(3))
     entering = np.einsum("na,na->n", np.cross(b - a, c - a), rays[ray, 3:]) < 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,8 @@ from dpcli.store.file import file_kind
 from dpcli.store.statistics import StatisticsReader, StatisticsWriter
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording
+from dpcli.store.writing.open_readers import OpenReaders, Reader
 
-Reader = Any  # of one of the kinds below; all have names, skipped, positions, provenance, given(), close()
 _OPEN = 256  # files held open at a time; shards are read in turn, and there may be a thousand
 _CACHE = 64 << 10  # bytes of chunks that each of their data sets may keep: a chunk is read from the disk's cache again
 
@@ -54,7 +53,7 @@ KINDS: dict[str, tuple[Callable[[Path], Reader], Callable[..., Any]]] = {
     "parts": (PartsReader, _parts),
     "scores": (ScoresReader, _scores),
     "statistics": (StatisticsReader, _statistics),
-}  # how a file is read, and how the writer of one like it is made
+}  # how a file is read (all readers have names, skipped, positions, provenance, given()), and how the writer of one like it is made
 
 
 @dataclass
@@ -75,8 +74,8 @@ def is_shard(reader: Reader) -> bool:
     return bool(reader.provenance) and shard_of(reader.provenance[-1]) is not None
 
 
-def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, resume: bool = True) -> None:
-    """Joins all shards of one run, one item in memory at a time, into the file of a single run, byte for byte.
+def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, resume: bool = True) -> Reader:
+    """Joins all shards of one run, one item in memory at a time, into the file of a single run, byte for byte; returns its reader.
 
     Goes on where a stopped or killed join ended; does nothing where it is done. resume: off where nobody could run it again
     (a pipe). Raises UsageError for missing, repeated or mixed shards, and where `output` is there and another; DataError
@@ -93,7 +92,7 @@ def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, res
     pieces = [_read_piece(open_file(path)) for path in paths]
     history = _common_history(pieces)
     if not force and already_made(output, history[-1], open_file, keys=WORK):
-        return
+        return open_file(output)
     owner, row = _find_places(pieces, output, history[-1])
     pattern = next((piece.reader for piece in pieces if len(piece.reader.names)), pieces[0].reader)
     root = {"seed": int(pattern.attributes.get("seed", 0)), "source": str(pattern.attributes.get("source", ""))}
@@ -101,6 +100,7 @@ def join_shards(paths: Sequence[Path], output: Path, *, force: bool = False, res
     with make_writer(pattern, output, **root) as writer:
         _copy(pieces, owner, row, writer)
         writer.skipped = _skipped(pieces)
+    return open_file(output)
 
 
 def _read_piece(reader: Reader) -> _Piece:
@@ -171,23 +171,14 @@ def _skipped(pieces: list[_Piece]) -> list[tuple[str, str]]:
 
 def _copy(pieces: list[_Piece], owner: np.ndarray, row: np.ndarray, writer: Any) -> None:
     """Writes the samples in the order of the whole; goes on where a stopped join ended."""
-    opened: OrderedDict[int, Reader] = OrderedDict()  # the latest used last
 
     def load(place: int) -> list[Any]:
-        number = int(owner[place])
-        opened[number] = pieces[number].reader
-        opened.move_to_end(number)
-        while len(opened) > _OPEN:
-            opened.popitem(last=False)[1].close()
-        return opened[number].given(int(row[place]))
+        return opened.use(pieces[owner[place]].reader).given(int(row[place]))
 
     def write(place: int, given: list[Any]) -> dict[str, float]:
         writer.write_again(given)
         return {}
 
     names = [pieces[own].reader.names[index] for own, index in zip(owner.tolist(), row.tolist())]
-    try:
+    with OpenReaders(_OPEN) as opened:
         ItemPass(writer, names, Wording("prepare merge", "sample", "copied")).run(_same, load, write, Workers())
-    finally:
-        for reader in opened.values():
-            reader.close()

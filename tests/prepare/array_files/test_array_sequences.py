@@ -13,7 +13,7 @@ import scipy.io
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.array_files.axes import axes_of, check_axes
 from dpcli.prepare.scans.array_sequences import MORE_FRAMES, UNCOUNTED, ArraySequences
-from dpcli.store import CloudsReader
+from dpcli.store import CloudSequence, CloudsReader
 from tests.support.commands import exit_code
 
 FORMS = ("npy", "npz", "h5", "mat", "mat packed", "mat 7.3")
@@ -80,8 +80,11 @@ def same(found: list[np.ndarray], frames: np.ndarray | list[np.ndarray]) -> bool
 def test_one_sequence_in_any_order_of_axes(tmp_path, form):
     clouds = tracked(1, 12, 90)
     for order in permutations(range(3)):
-        path = write(tmp_path / "".join("TNC"[k] for k in order), form, points=clouds.transpose(order))
-        assert same(read(path)[path.stem], clouds), order
+        write(tmp_path / "raw" / "".join("TNC"[k] for k in order), form, points=clouds.transpose(order))
+    found = read(tmp_path / "raw")
+    assert len(found) == 6
+    for order, frames in found.items():
+        assert same(frames, clouds), order
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -278,20 +281,31 @@ def test_axes_are_checked_before_anything_is_read():
     assert axes_of(tracked(2, 20, 60).transpose(1, 0, 2)) == "NTC"
 
 
-@pytest.mark.parametrize("form", ("mat", "mat packed", "mat 7.3", "h5"))
-@pytest.mark.parametrize("kind", (np.uint16, np.float64))
-def test_depth_of_kinect_data_sets(tmp_path, form, kind):
+def clouds_of_depth(path: Path) -> CloudSequence:
+    output = path.with_suffix(".out")
+    assert exit_code("prepare", "depth", path, "-o", output, "--jobs", 1, "--item-seconds", 0) == 0
+    with CloudsReader(output) as reader:
+        return reader.read(0)
+
+
+@pytest.fixture(scope="module")
+def kinect(tmp_path_factory) -> tuple[np.ndarray, CloudSequence]:
+    """Depth u16 (T,H,W), and the clouds that it becomes from a .npy."""
     v, u = np.mgrid[:120, :160]
     depth = np.stack([(1500 + 300 * np.sin((u + 9 * t) / 20) + v).astype(np.uint16) for t in range(3)])
-    np.save(tmp_path / "truth.npy", depth)
+    path = tmp_path_factory.mktemp("kinect") / "truth.npy"
+    np.save(path, depth)
+    return depth, clouds_of_depth(path)
+
+
+@pytest.mark.parametrize("form", ("mat", "mat packed", "mat 7.3", "h5"))
+@pytest.mark.parametrize("kind", (np.uint16, np.float64))
+def test_depth_of_kinect_data_sets(tmp_path, kinect, form, kind):
+    depth, truth = kinect
     stored = depth.transpose(1, 2, 0).astype(kind) if form.startswith("mat") else depth
-    path = write(tmp_path / "video", form, d_depth=stored, d_time=np.arange(3.0))
-    for given in (path, tmp_path / "truth.npy"):
-        output = tmp_path / f"{given.stem}.out"
-        assert exit_code("prepare", "depth", given, "-o", output, "--jobs", 1, "--item-seconds", 0) == 0
-    with CloudsReader(tmp_path / "video.out") as found, CloudsReader(tmp_path / "truth.out") as truth:
-        assert np.array_equal(found.read(0).points, truth.read(0).points)
-        assert np.array_equal(found.read(0).frame_offsets, truth.read(0).frame_offsets)
+    found = clouds_of_depth(write(tmp_path / "video", form, d_depth=stored, d_time=np.arange(3.0)))
+    assert np.array_equal(found.points, truth.points)
+    assert np.array_equal(found.frame_offsets, truth.frame_offsets)
 
 
 def walkers(rng: np.random.Generator, frames: int, points: int) -> np.ndarray:

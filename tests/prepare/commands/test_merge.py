@@ -15,13 +15,12 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, Stopped, UsageError
-from dpcli.prepare.commands import merge as module
-from dpcli.prepare.commands import sources
-from dpcli.prepare.commands.merge import merge, read_source
+from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.writing.open_readers import OpenReaders
 from tests.support.commands import told as dpc
 from tests.support.prepare_helpers import ROOT, ToyReader
 
@@ -74,14 +73,13 @@ def test_files_of_equal_classes_follow_one_another(tmp_path):
         merge(paths, tmp_path / "all.h5")
 
 
-def test_many_files_are_not_all_open_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(sources, "_OPEN", 2)
-    paths = [write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"]) for k in range(5)]
-    files = module.OpenFiles()
-    for path in [*paths, *paths]:
-        assert files.read(path, 0).name == f"{path.stem}x"
-        assert len(files._readers) <= 2
-    files.close()
+def test_many_files_are_not_all_open_at_once(tmp_path):
+    readers = [CloudsReader(write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"])) for k in range(5)]
+    with OpenReaders(2) as opened:
+        for reader in [*readers, *readers]:
+            assert opened.use(reader).read(0).name == f"{reader.path.stem}x"
+            assert sum(one._file is not None for one in readers) <= 2
+    assert not any(one._file for one in readers)
 
 
 def test_objects_of_few_and_of_many_parts_are_joined(tmp_path):
@@ -216,7 +214,7 @@ merge([Path(word) for word in FILES], Path(OUT), prefix=True)
 
 @pytest.mark.parametrize("shards", [False, True])
 def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkeypatch, shards):
-    """kill -9 three times in the middle: each time what was copied stays, and only the rest is copied."""
+    """kill -9 twice in the middle: each time what was copied stays, and only the rest is copied."""
     monkeypatch.setattr(sys, "argv", ["dpc", "prepare", "merge"])
     if shards:
         paths = [tmp_path / f"{k}.h5" for k in range(3)]
@@ -230,7 +228,7 @@ def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkey
     total = merge(paths, whole, prefix=not shards).written
     script = script.replace("FILES", repr([str(path) for path in paths])).replace("OUT", repr(str(out)))
     journal, kept = tmp_path / ".out.h5.part", 0
-    for _ in range(3):
+    for _ in range(2):
         process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.DEVNULL)
         deadline = time.monotonic() + 60
         while process.poll() is None and time.monotonic() < deadline:
@@ -294,7 +292,7 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
     paths = [tmp_path / f"shard{k}.h5" for k in range(2)]
     for index, path in enumerate(paths):
         convert(ToyReader(bad=(1,)), path, Conversion(shard=Shard(index, 2)))
-    entry = shard_of(read_source(paths[0]).provenance[-1])[1]
+    entry = shard_of(CloudsReader(paths[0]).provenance[-1])[1]
     for names, fine in ((["toy000"], True), (["toy000", "toy001"], False)):
         with pytest.raises(Stopped), CloudsWriter(tmp_path / "x.h5", provenance=entry, resume=True) as writer:
             for name in names:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.merge import merge
-from dpcli.prepare.commands.sources import read_source
+from dpcli.prepare.commands.sources import open_source
 from dpcli.prepare.commands.split import SplitChoice, draw_splits, split, splits_by_list
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.commands import told as dpc
@@ -87,7 +87,7 @@ def test_by_subject(whole, tmp_path):
 )
 def test_a_list_may_spell_our_splits_in_its_own_way(tmp_path, whole, word, split):
     (tmp_path / "list.csv").write_text(f"Name,Split\ns03,{word}\n")
-    assert splits_by_list(read_source(whole), tmp_path / "list.csv") == ["", "", "", split, *[""] * 8]
+    assert splits_by_list(open_source(whole), tmp_path / "list.csv") == ["", "", "", split, *[""] * 8]
 
 
 def test_by_list(whole, tmp_path):
@@ -126,12 +126,12 @@ def test_a_list_in_any_dialect_of_tables(tmp_path, whole, encoding, divider, lin
     text = "\r\n".join(lines).replace("*", divider)
     (tmp_path / "list.csv").write_bytes(text.encode(encoding))
     expected = ["", "", "", "test", "", "train", *[""] * 6]
-    assert splits_by_list(read_source(whole), tmp_path / "list.csv") == expected
+    assert splits_by_list(open_source(whole), tmp_path / "list.csv") == expected
 
 
 def test_a_misspelled_split_is_told(tmp_path, whole, capsys):
     (tmp_path / "list.csv").write_text("s03,trian\ns04,test\n")
-    splits_by_list(read_source(whole), tmp_path / "list.csv")
+    splits_by_list(open_source(whole), tmp_path / "list.csv")
     assert "stay as they are: trian" in capsys.readouterr().err
 
 

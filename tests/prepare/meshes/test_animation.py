@@ -23,7 +23,7 @@ from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film, ground_tr
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 from dpcli.prepare.meshes.gltf_nodes import clip_names
-from dpcli.prepare.meshes.raycast import FrameCaster, pixel_rays, sample_texture
+from dpcli.prepare.meshes.raycast import FrameCaster, sample_texture, world_rays
 from dpcli.prepare.meshes.skinning import Curve, matrices, skin, slerp, vertex_normals
 from dpcli.runtime.seeds import generator
 from dpcli.store.views import ViewsReader
@@ -241,7 +241,7 @@ def test_light_stays_with_the_world():
 
 def test_rays_go_through_the_pixels_they_belong_to():
     intrinsics, pose = pinhole(0.9, 40, 30), orbit_pose(0.4, -0.3, 2.0)
-    rays = pixel_rays(intrinsics, pose, slice(3, 9), slice(5, 20), 2).astype(float)
+    rays = world_rays(intrinsics, pose, slice(3, 9), slice(5, 20), 2).astype(float)
     point = (rays[..., :3] + 1.7 * rays[..., 3:]) @ pose[:3, :3].T + pose[:3, 3]
     pixel = point @ intrinsics.T
     x, y = pixel[..., 0] / pixel[..., 2], pixel[..., 1] / pixel[..., 2]

@@ -203,6 +203,7 @@ def test_tracks_of_views_become_clouds(tmp_path: Path, refused: Callable[..., st
         np.testing.assert_array_equal(sequence.part.reshape(4, 200), np.tile(views.part, (4, 1)))
         np.testing.assert_array_equal(sequence.track.reshape(4, 200), np.tile(np.arange(200), (4, 1)))
         np.testing.assert_array_equal(sequence.time, views.header.time)
+        assert clouds.provenance[:-1] == views.provenance
     scaled = ("prepare", "clouds", tmp_path / "views.h5", "-o", tmp_path / "scaled.h5", "--scale", "1000")
     assert 0 == exit_code(*scaled)
     with CloudsReader(tmp_path / "scaled.h5") as clouds:  # as of other inputs: `--unit` names it, by default meters
