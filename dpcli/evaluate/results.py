@@ -52,6 +52,22 @@ class Result:
     incomplete: str = ""
 
 
+@dataclass(kw_only=True)
+class Report:
+    """Holds what the evaluation of some samples says beside its metrics.
+
+    names: the samples that count. truth: what they were compared with. intervals: by metric, empty without `resampling`.
+    provenance: that of the predictions.
+    """
+
+    names: list[str]
+    truth: str
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    left_out: list[LeftOut]
+    provenance: list[dict]
+
+
 def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
     """Returns the statistics of all parts together: arrays one after the other, numbers summed. Raises DataError without parts."""
     parts = list(parts)
@@ -133,7 +149,7 @@ def none_if_nan(value: float) -> float | None:
 def report_json(
     task: str,
     source: str,
-    report: Any,
+    report: Report,
     kind: str,
     *,
     protocol: Mapping[str, Any],
@@ -141,9 +157,9 @@ def report_json(
     units: Mapping[str, str],
     denominators: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Returns the object of `--json` of a report that holds `names`, `resampling`, `intervals`, `left_out` and `provenance`.
+    """Returns the object of `--json` of a report.
 
-    source: the file, as it was named. kind: what `names` are, and what was resampled.
+    source: the file, as it was named. kind: what the report's names are, and what was resampled.
     """
     return {
         "task": task,

@@ -8,7 +8,7 @@ from typing import Literal
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import check, setting
 
-Path = Literal["turntable", "orbit", "swing", "fixed", "reference"]
+CameraPath = Literal["turntable", "orbit", "swing", "fixed", "reference"]
 Color = Literal["appearance", "part", "rigid", "depth"]
 
 
@@ -16,7 +16,7 @@ Color = Literal["appearance", "part", "rigid", "depth"]
 class RenderSettings:
     """Holds how a scene is drawn. None stands for the reference camera's own. Raises UsageError for a value that is not legal."""
 
-    path: Path = setting(
+    path: CameraPath = setting(
         "turntable",
         "Path of the camera: turntable (once around), orbit (also up and down), swing, fixed, or reference (the input's own camera).",
     )

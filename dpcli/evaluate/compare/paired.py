@@ -82,17 +82,12 @@ class CompareReport:
 
 
 def evaluate_compare(
-    first: Path,
-    second: Path,
-    options: EvaluationOptions,
-    resampling: Resampling,
-    sources: tuple[str, str] | None = None,
+    first: Path, second: Path, options: EvaluationOptions, resampling: Resampling, sources: tuple[str, str]
 ) -> CompareReport:
     """Compares two scores files, parts files or videos with a truth. Raises DataError where they aren't of the same samples.
 
     sources: how the files were named, for messages.
     """
-    sources = sources or (str(first), str(second))
     kinds = [kind_of_file(path, source) for path, source in zip((first, second), sources, strict=True)]
     if kinds[0] != kinds[1]:
         raise DataError(f"{sources[0]}: {kinds[0]}, {sources[1]}: {kinds[1]}; nothing to compare")

@@ -92,8 +92,7 @@ def evaluate_video(
     with closing(open_source(Path(truth))) as real, closing(open_source(Path(path), truth=real)) as predicted:
         names = _choose_metrics(metrics, predicted, real)
         pictured = [name for name in names if name in PICTURE_METRICS]
-        left_out: list[LeftOut] = []
-        pairs = match_views(predicted, real, chosen, intersect, left_out) if pictured else []
+        pairs, left_out = match_views(predicted, real, chosen, intersect) if pictured else ([], [])
         frames = FramePass(predicted, real, chosen, pictured, intersect, watch or (lambda *_: None), left_out)
         views = frames.score_views(pairs)
         learned_names = [name for name in names if name in LEARNED_METRICS]
@@ -138,7 +137,7 @@ def _learned_scores(
     others = replace(frames.protocol, views=frames.protocol.learned_views or frames.protocol.views)
     second = replace(frames, left_out=[], hollow=0)
     if made:
-        pairs = match_views(frames.predicted, frames.truth, others, frames.intersect, second.left_out)
+        pairs, second.left_out = match_views(frames.predicted, frames.truth, others, frames.intersect)
         second.feed(pairs, made, missing)
     frames.size, frames.misnumbered, frames.swapped = second.size, second.misnumbered, second.swapped
     frames.hollow = frames.hollow or second.hollow
