@@ -18,6 +18,7 @@ from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
 
 _NAMES_IN_NOTE = 10
+_SAID: set[str] = set()
 KEPT_STATISTICS = (
     "statistics that an evaluation kept; `dpc evaluate segmentation FILE --json` (or motion) makes the result of them that"
     " `runs` and `report` take, `compare` needs the parts files"
@@ -113,9 +114,10 @@ def tell_split(path: str | Path, split: str | None, splits: Sequence[str]) -> No
     """Warns where no split was asked for and no sample is of "test", so that those of "train" count, beside others."""
     if split is None and "test" not in splits and {"train"} < {*splits}:
         found = list_names(sorted({*splits} - {"train"}))
-        log.warn(
-            f"{path}: no split is called 'test', so all samples count, those of 'train', too; there are {found} (--split)"
-        )
+        with log.each_once(_SAID):  # segmentation and motion of a file may both be evaluated, beside another file's
+            log.warn(
+                f"{path}: no split is called 'test', so all samples count, those of 'train', too; there are {found} (--split)"
+            )
 
 
 def list_names(names: Sequence[str]) -> str:

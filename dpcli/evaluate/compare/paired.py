@@ -100,7 +100,8 @@ def evaluate_compare(
         for task, one in tasks[0].items()
         if task in tasks[1]
     ]
-    notes = [
+    notes = ["A and B are the same file, so nothing can differ."] if first.samefile(second) else []
+    notes += [
         f"{task.capitalize()}: only {source} can be evaluated, so it isn't compared."
         for source, own, other in zip(sources, tasks, tasks[::-1], strict=True)
         for task in own
