@@ -194,14 +194,14 @@ def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
         "denominators": {key: counts[key] for key in _COUNTS if key in counts},
     }
     return Run(
-        _title(own, source),
-        source,
-        str(own.get("task", "")),
-        metrics,
-        {key: str(own["units"][key]) for key in metrics},
-        identity,
-        notes,
-        _seed(own),
+        title=_title(own, source),
+        source=source,
+        task=str(own.get("task", "")),
+        metrics=metrics,
+        units={key: str(own["units"][key]) for key in metrics},
+        identity=identity,
+        notes=notes,
+        seed=_seed(own),
     )
 
 
