@@ -19,17 +19,20 @@ _NARROW, _WIDE = 0.6, 2.0  # a cell's width as a multiple of its height
 
 
 def spread_samples(labels: np.ndarray, count: int) -> list[int]:
+    """Returns at most `count` samples: those of `first_of_classes`, or of a single class evenly chosen ones."""
+    return spread_evenly(len(labels), count) if len(np.unique(labels)) == 1 else first_of_classes(labels, count)
+
+
+def first_of_classes(labels: np.ndarray, count: int) -> list[int]:
     """Returns at most `count` samples: the first of each class (or of evenly chosen classes), then the second of each, ...
 
-    >>> spread_samples(np.array([0, 0, 0, 1, 2, 2]), 4)
+    >>> first_of_classes(np.array([0, 0, 0, 1, 2, 2]), 4)
     [0, 1, 3, 4]
     """
     members: dict[int, list[int]] = defaultdict(list)
     for index, label in enumerate(np.asarray(labels).tolist()):
         members[label].append(index)
     classes = sorted(members)
-    if len(classes) == 1:
-        return spread_evenly(len(labels), count)
     if count < len(classes):
         chosen = np.linspace(0, len(classes) - 1, count).round().astype(int)
         return [members[classes[i]][0] for i in chosen]

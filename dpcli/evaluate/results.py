@@ -18,6 +18,7 @@ from dpcli.path_names import first_names
 from dpcli.runtime.progress import log
 
 _NAMES_IN_NOTE = 10
+_SAID: set[str] = set()
 KEPT_STATISTICS = (
     "statistics that an evaluation kept; `dpc evaluate segmentation FILE --json` (or motion) makes the result of them that"
     " `runs` and `report` take, `compare` needs the parts files"
@@ -50,6 +51,22 @@ class Result:
     tables: list[TextTable] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     incomplete: str = ""
+
+
+@dataclass(kw_only=True)
+class Report:
+    """Holds what the evaluation of some samples says beside its metrics.
+
+    names: the samples that count. truth: what they were compared with. intervals: by metric, empty without `resampling`.
+    provenance: that of the predictions.
+    """
+
+    names: list[str]
+    truth: str
+    resampling: Resampling
+    intervals: dict[str, Interval]
+    left_out: list[LeftOut]
+    provenance: list[dict]
 
 
 def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
@@ -97,9 +114,10 @@ def tell_split(path: str | Path, split: str | None, splits: Sequence[str]) -> No
     """Warns where no split was asked for and no sample is of "test", so that those of "train" count, beside others."""
     if split is None and "test" not in splits and {"train"} < {*splits}:
         found = list_names(sorted({*splits} - {"train"}))
-        log.warn(
-            f"{path}: no split is called 'test', so all samples count, those of 'train', too; there are {found} (--split)"
-        )
+        with log.each_once(_SAID):  # segmentation and motion of a file may both be evaluated, beside another file's
+            log.warn(
+                f"{path}: no split is called 'test', so all samples count, those of 'train', too; there are {found} (--split)"
+            )
 
 
 def list_names(names: Sequence[str]) -> str:
@@ -133,7 +151,7 @@ def none_if_nan(value: float) -> float | None:
 def report_json(
     task: str,
     source: str,
-    report: Any,
+    report: Report,
     kind: str,
     *,
     protocol: Mapping[str, Any],
@@ -141,9 +159,9 @@ def report_json(
     units: Mapping[str, str],
     denominators: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Returns the object of `--json` of a report that holds `names`, `resampling`, `intervals`, `left_out` and `provenance`.
+    """Returns the object of `--json` of a report.
 
-    source: the file, as it was named. kind: what `names` are, and what was resampled.
+    source: the file, as it was named. kind: what the report's names are, and what was resampled.
     """
     return {
         "task": task,

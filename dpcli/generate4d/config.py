@@ -11,14 +11,14 @@ from typing import Any, Literal
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog, Given
-from dpcli.runtime.settings.fields import WIDEST, check, setting
+from dpcli.runtime.settings.fields import WIDEST, Settings, setting
 
 Start = Literal["auto", "sphere", "inflate", "hull"]
 Prior = Literal["auto", "none", "inflated", "network", "views", "zero123"]
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Settings):
     """Holds how a scene is fitted. Lengths are in the scene's unit (the object fits a sphere of 0.75), rates are Adam's.
 
     Weights of losses are those of the thesis (5.4.3 and C.2) where it gives them, else those of SC4D (Wu et al. 2024):
@@ -121,7 +121,7 @@ class FitConfig:
     inversion: float = setting(0.5, "Probability that a picture's background is black, not white.", least=0, most=1)
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.max_gaussians < self.gaussians:
             raise UsageError(
                 f"max_gaussians = {self.max_gaussians}: expected at least the {self.gaussians} of the start (gaussians)"
@@ -144,7 +144,7 @@ class FitConfig:
 
 
 @dataclass(frozen=True)
-class Supervision:
+class Supervision(Settings):
     """Holds what guides the sides of the object that nobody filmed. Raises UsageError for a value that is not legal."""
 
     prior: Prior = setting(
@@ -160,9 +160,6 @@ class Supervision:
     regularize: bool = setting(
         True, "Keep the object from becoming flat by the loss `thickness` and the limit `aspect`."
     )
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 CATALOG = Catalog(fit=FitConfig, supervision=Supervision)

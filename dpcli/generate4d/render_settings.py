@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
-Path = Literal["turntable", "orbit", "swing", "fixed", "reference"]
+CameraPath = Literal["turntable", "orbit", "swing", "fixed", "reference"]
 Color = Literal["appearance", "part", "rigid", "depth"]
 
 
 @dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(Settings):
     """Holds how a scene is drawn. None stands for the reference camera's own. Raises UsageError for a value that is not legal."""
 
-    path: Path = setting(
+    path: CameraPath = setting(
         "turntable",
         "Path of the camera: turntable (once around), orbit (also up and down), swing, fixed, or reference (the input's own camera).",
     )
@@ -48,9 +48,6 @@ class RenderSettings:
     )
     trajectories: bool = setting(False, "Draw the trails of control points, or of Gaussians where there are none.")
     columns: int = setting(8, "Instants of the clip on the contact sheet of --picture.", least=1, most=60)
-
-    def __post_init__(self) -> None:
-        check(self)
 
     def changed(self, *names: str) -> list[str]:
         """Returns those of the named settings that differ from their defaults."""

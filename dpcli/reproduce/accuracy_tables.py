@@ -36,9 +36,8 @@ from dpcli.reproduce.runs import (
 from dpcli.store import CloudsReader
 
 STREAMS = ("static", "dynamic", "fused")
-MORE = (
-    "--epochs 15 --set epochs_dynamic=40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
-)
+# the networks of 4 to 24 frames in docs/results.md were made so
+MORE = "--epochs 15 --set epochs_dynamic=40 --lr 0.0005"
 _RAW = "the data set's folder; - with --clouds"
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
@@ -145,13 +144,11 @@ class Plan:
     def __str__(self) -> str:
         """Returns what a reader has to type."""
         said = f"`dpc classify train {' '.join(['--preset', self.preset, '--validation none', *self.budget])}`"
+        if not self.first:
+            return said
         return (
-            said
-            if not self.first
-            else (
-                f"{said} at {self.first} frames, from whose network of the same seed the other lengths go on "
-                f"(`--init`, `{' '.join(self.more)}`)"
-            )
+            f"{said} at {self.first} frames, from whose network of the same seed the other lengths go on "
+            f"(`--init`, `{' '.join(self.more)}`)"
         )
 
 

@@ -107,16 +107,8 @@ class Fold:
 
     def train(self, run: Dpc, out: Path, *words: str) -> None:
         """Trains a network of the fold by the words after the common ones."""
-        run(
-            "classify",
-            "train",
-            self.clouds,
-            "-o",
-            out,
-            *override(self.words, words),
-            "--validation",
-            f"fold:{self.which}/{self.of}",
-        )
+        held_out = ("--validation", f"fold:{self.which}/{self.of}")
+        run("classify", "train", self.clouds, "-o", out, *override(self.words, words), *held_out)
 
     def _key(self, words: Sequence[str]) -> list:
         return [digest(self.clouds), self.words, words]

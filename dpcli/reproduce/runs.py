@@ -183,18 +183,8 @@ class Cell:
         print(f"tables: {self.scores}", file=sys.stderr)
         if self.trains:
             run("classify", "train", self.clouds, "-o", self.model, *self.train)
-        run(
-            "classify",
-            "predict",
-            self.clouds,
-            "--model",
-            self.model,
-            "-o",
-            self.scores,
-            "--split",
-            "test",
-            *self.predict,
-        )
+        words = ("--model", self.model, "-o", self.scores, "--split", "test", *self.predict)
+        run("classify", "predict", self.clouds, *words)
         return counted(run, self.scores)
 
 

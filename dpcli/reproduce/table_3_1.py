@@ -82,20 +82,8 @@ def pretrained(modelnet: str, folder: Path, preset: str, words: Sequence[str], r
     shapes, out = folder / "modelnet40.h5", folder / f"{preset}-modelnet40"
     folder.mkdir(parents=True, exist_ok=True)
     run("prepare", "modelnet40", modelnet, "-o", shapes)
-    run(
-        "classify",
-        "train",
-        shapes,
-        "-o",
-        out,
-        "--preset",
-        preset,
-        "--validation",
-        "none",
-        "--set",
-        "pretrain=true",
-        *words,
-    )
+    said = ("--preset", preset, "--validation", "none", "--set", "pretrain=true", *words)
+    run("classify", "train", shapes, "-o", out, *said)
     return out
 
 

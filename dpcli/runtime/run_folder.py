@@ -90,9 +90,11 @@ class RunFolder:
     It holds `config.json`, `settings.toml`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`,
     `curves.png`.
 
-    columns: what a row of the log holds. curves: draws the rows into a picture file. Only looks until it is entered (`with`):
-    that makes the folder, with `force` empties it of an earlier run, and keeps other processes from writing into it by
-    a lock on the file `.lock`, which is gone at the end; a killed run may leave that file, which then locks nothing.
+    config: what must be equal for a run to continue, compared as JSON holds it. columns: what a row of the log holds.
+    curves: draws the rows into a picture file. Only looks until it is entered (`with`): that makes the folder, with
+    `force` empties it of an earlier run, and keeps other processes from writing into it by a lock on the file `.lock`,
+    which is gone at the end; a killed run may leave that file, which then locks nothing.
+
     Raises UsageError when the folder holds a run of another configuration, or files of a run without one, and `force`
     is off; DpcError on entering when another process is there.
     """
@@ -107,7 +109,7 @@ class RunFolder:
         curves: Callable[[list[dict], Path], None] | None = None,
     ) -> None:
         self.columns, self.curves = tuple(columns), curves
-        self.path, self.config, self.force = Path(path), config, force
+        self.path, self.config, self.force = Path(path), json.loads(json.dumps(config)), force
         self.rows: list[dict] = []
         # rows that the picture shows; when it may be drawn next
         self._drawn, self._draw_again = 0, time.monotonic() + _FIRST_PICTURE

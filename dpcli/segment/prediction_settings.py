@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting, settings_of
+from dpcli.runtime.settings.fields import Settings, setting, settings_of
 from dpcli.segment.baselines.settings import METHODS, ClassicalSettings
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.config import Precision
@@ -16,7 +16,7 @@ from dpcli.segment.scene.settings import SceneSettings
 
 
 @dataclass(frozen=True)
-class InputSettings:
+class InputSettings(Settings):
     """Holds which sequences are divided, and how the flow between their frames is estimated."""
 
     flow: str = setting(
@@ -27,12 +27,9 @@ class InputSettings:
     )
     split: str = setting("all", "Sequences of this split, or all.")
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True)
-class Refinement:
+class Refinement(Settings):
     """Holds what is done with the masks that a segmenter gives, and which motions are fitted to them."""
 
     points: int = setting(
@@ -49,9 +46,6 @@ class Refinement:
         least=0,
     )
     normalize: bool = setting(True, "Scale each sequence to diameter 1 before it is looked at.")
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 class PredictSettings(NamedTuple):

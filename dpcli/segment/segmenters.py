@@ -70,12 +70,10 @@ class NetworkSegmenter(FrameSegmenter):
 
     @property
     def slots(self) -> int:
-        """Returns the network's number of slots."""
         return self.model.config.slots
 
     @torch.inference_mode()
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Returns the masks that the network gives; it looks at no flow."""
         if len({len(frame) for frame in frames}) == 1:
             chunks = torch.stack(frames).split(_CHUNK)
             return [mask.cpu() for chunk in chunks for mask in self.model(chunk.to(self.device)).mask]
@@ -99,7 +97,6 @@ class ClassicalSegmenter(FrameSegmenter):
         return max(self.settings.max_parts, self.settings.parts or 0)
 
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Returns the method's labels as masks of zeros and ones."""
         labels = classical_labels(
             [frame.numpy() for frame in frames],
             {pair: flow.numpy() for pair, flow in flows.items()},

@@ -16,25 +16,22 @@ import typer
 from dpcli.cli.settings_options import options_of
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings.catalog import Catalog, Given
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 from dpcli.runtime.settings.value_types import is_tuple, write_text
 from tests.fuzz.fuzz_options import SETTINGS
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Settings):
     """What a network is made of."""
 
     num_frames: int = setting(16, "Frames per clip.", least=1, name="frames")
     centroids: tuple[int, int] = setting((1024, 512), "Neighborhoods of the two stages.", least=1)
     dropout: float = setting(0.0, "Dropout before the last layer.", least=0, below=1)
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Settings):
     """How long and how fast."""
 
     decay: Literal["cosine", "constant"] = setting("cosine", "Course of the learning rate.")
@@ -42,9 +39,6 @@ class Schedule:
     amp: bool | None = setting(None, "Products in bfloat16.")
     drop_short: bool = setting(False, "Leave short videos out.")
     workers: int | None = setting(None, "Processes that load.", least=0)
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 CATALOG = Catalog(network=Network, schedule=Schedule)

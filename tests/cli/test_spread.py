@@ -242,10 +242,10 @@ DEADLY = """
 import os, signal
 from dpcli.segment.commands.estimate_flow import FlowOfSequence
 class Deadly(FlowOfSequence):
-    def __call__(self, numbered):
-        if numbered[0] == 4:
+    def __call__(self, sequence):
+        if sequence.name == "v4":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(numbered)
+        return super().__call__(sequence)
 """
 RUN_DEADLY = """
 import sys

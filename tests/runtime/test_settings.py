@@ -14,11 +14,11 @@ from dpcli import __version__
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.settings import value_types as kinds
 from dpcli.runtime.settings.catalog import Catalog, Given
-from dpcli.runtime.settings.fields import check, setting, settings_of
+from dpcli.runtime.settings.fields import Settings, setting, settings_of
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Settings):
     """What a network is made of."""
 
     num_classes: int = 20  # no setting: the data say it
@@ -32,13 +32,13 @@ class Network:
     stride: Literal[1, 2, 4] = setting(1, "Every n-th frame.")
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.centroids[1] > self.centroids[0]:
             raise UsageError(f"centroids = {kinds.write_text(self.centroids)}: expected the second not above the first")
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Settings):
     """How long and how fast."""
 
     batch: int = setting(16, "Clips per step.", least=1)
@@ -51,9 +51,6 @@ class Schedule:
     initial: str | None = setting(None, "A model to start from.")
     note: str = setting("", "Any text.")
     offset: float = setting(0.0, "Any number.")
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 CATALOG = Catalog(network=Network, schedule=Schedule)

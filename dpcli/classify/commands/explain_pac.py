@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, ac
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model
+from dpcli.draw.clouds_sheet import first_of_classes
 from dpcli.draw.view import default_view, parse_view
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
@@ -73,7 +73,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
         axes = parse_view(settings.view or default_view(reader.length_unit, reader.provenance))
-        pool = _pool(reader, request.samples, task, info)
+        pool = select_videos(reader, task.split, info, task.model) if _is_count(reader, request.samples) else []
         sequences = chosen_samples(reader, request.samples, pool)
         source = task.clips(reader, sequences, info)
         entry = provenance.record(_record(task, request, streams, info), task.seed, {"clouds": path})
@@ -134,22 +134,14 @@ def _target(text: str | None, class_names: list[str]) -> str | int:
     raise UsageError(f"class = {text}: the model knows {', '.join(class_names)}; or say predicted or label")
 
 
-def _pool(reader: CloudsReader, samples: str, task: ModelTask, info: ModelInfo) -> list[int]:
-    """Returns the sequences that a number of samples is taken from: those of the split; names may be of any."""
-    if _is_count(reader, samples):
-        return select_videos(reader, task.split, info, task.model)
-    return list(range(len(reader)))
-
-
 def _is_count(reader: CloudsReader, samples: str) -> bool:
     return samples.isdigit() and samples not in reader.names
 
 
 def chosen_samples(reader: CloudsReader, wanted: str, pool: Sequence[int]) -> list[int]:
-    """Returns the sequences named in `wanted` (with commas between) in that order, or so many of the pool.
+    """Returns the sequences named in `wanted` (with commas between) in that order, or so many of the pool, by `first_of_classes`.
 
-    Of a number it takes the first video of each class, of evenly chosen classes where there are more, then the second of
-    each, and so on. Raises DataError for a name that isn't there, UsageError for the number 0.
+    Raises DataError for a name that isn't there, UsageError for the number 0.
     """
     if not _is_count(reader, wanted):
         names = [wanted] if wanted in reader.names else [name for name in wanted.split(",") if name]
@@ -162,14 +154,7 @@ def chosen_samples(reader: CloudsReader, wanted: str, pool: Sequence[int]) -> li
     count = int(wanted)
     if count < 1:
         raise UsageError(f"--samples {wanted}: expected 1 or more, or names")
-    members: dict[int, list[int]] = defaultdict(list)
-    for index in pool:
-        members[int(reader.labels[index])].append(index)
-    classes = sorted(members)
-    if count < len(classes):
-        return [members[classes[i]][0] for i in np.linspace(0, len(classes) - 1, count).round().astype(int)]
-    turns = sorted((turn, label, index) for label in classes for turn, index in enumerate(members[label]))
-    return [index for _, _, index in sorted(turns[:count], key=lambda item: item[1:])]
+    return [pool[place] for place in first_of_classes(reader.labels[list(pool)], count)]
 
 
 class _ActivationWriter(CloudsWriter):

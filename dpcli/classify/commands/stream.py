@@ -66,8 +66,8 @@ class StreamOptions:
 
 
 @dataclass(frozen=True)
-class Speaker:
-    """Says what predictions are made with: class names, the streams that were trained, confidence, window and hop in frames."""
+class StreamModel:
+    """Says what a listener has to know of the model: its classes, trained streams and confidence, window and hop in frames."""
 
     class_names: list[str]
     streams: Sequence[str]
@@ -76,7 +76,7 @@ class Speaker:
     hop: int
 
 
-def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callable[[Speaker], Listener]) -> int:
+def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callable[[StreamModel], Listener]) -> int:
     """Predicts until the stream ends, a frame is bad or a signal comes; what was predicted is kept and summed up each time.
 
     new_listener: makes the one who takes the predictions. Returns the number of frames.
@@ -86,14 +86,14 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     device = choose_device(task.device)
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
     confidence = choose_confidence(info.notes, options.reject_below, task.model)
-    speaker = Speaker(info.class_names, predictor.streams, confidence, predictor.window.size, options.hop)
+    told = StreamModel(info.class_names, predictor.streams, confidence, predictor.window.size, options.hop)
     frames = open_frames(task.data, options.follow, options.files, info.config.columns)
     keep_freed_memory()
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
         watch = _IrregularFrames(info.timing == "slots")
         tell = partial(_tell_unlike, task, info)
-        problem = _follow(predictor, frames, new_listener(speaker), stop, watch, tell)
+        problem = _follow(predictor, frames, new_listener(told), stop, watch, tell)
         if not predictor.clips:
             raise problem or _nothing_seen(task.source, watch.counts[_EMPTY])
         if target is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -317,7 +316,7 @@ def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any
         for key, option in _STARTS.items()
         if run[key]
     }
-    record = {
+    return {
         "network": asdict(settings.network),
         "schedule": schedule,
         "augmentation": asdict(settings.augmentation),
@@ -326,7 +325,6 @@ def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any
         "seed": seed,
         "data": digest,
     }
-    return json.loads(json.dumps(record))
 
 
 def _notes(videos: _Videos, seed: int) -> dict[str, Any]:

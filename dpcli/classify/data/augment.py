@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 _WAVES, _FREQUENCY = 3, 4.0  # waves of a warp; standard deviation of their frequencies, radians per unit of length
 
 
 @dataclass(frozen=True)
-class Augmentation:
+class Augmentation(Settings):
     """Holds the ranges of the random changes, 0 switches one off; called with a clip, changes it. One draw a clip, so that
     motion within it stays as it is.
 
@@ -73,9 +73,6 @@ class Augmentation:
         below=1,
         name="augment_still",
     )
-
-    def __post_init__(self) -> None:
-        check(self)
 
     def __call__(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Returns the clip f32 (T,P,3), changed as drawn from the generator, in a new array of the same shape.

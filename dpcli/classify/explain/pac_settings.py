@@ -7,11 +7,11 @@ from typing import Literal
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class PacSettings:
+class PacSettings(Settings):
     """Holds what is asked of each clip and how pictures show it. Raises UsageError for a class that no rule asks for."""
 
     rule: Literal["activation", "gradient"] = setting(
@@ -29,7 +29,7 @@ class PacSettings:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.target is not None and self.rule == "activation":
             raise UsageError(
                 "class: the rule activation (thesis A.1.4) doesn't depend on a class; add --set rule=gradient"

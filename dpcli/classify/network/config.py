@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import WIDEST, check, setting
+from dpcli.runtime.settings.fields import WIDEST, Settings, setting
 from dpcli.runtime.settings.stored import from_json
 from dpcli.store.schema import kept_name
 
@@ -30,7 +30,7 @@ _MOST_POINTS = 1 << 22  # of a clip: 85 times those of the thesis
 
 
 @dataclass(frozen=True)
-class KinetConfig:
+class KinetConfig(Settings):
     """Holds the settings of a Kinet. The defaults are the thesis's text, but for `static_temporal_radius`: the preset `thesis`
     says 0, and models made before it was a choice have None. `release()` gives the published code's choices.
 
@@ -144,7 +144,7 @@ class KinetConfig:
     def __post_init__(self) -> None:
         if self.num_classes < 1:
             raise UsageError(f"number of classes {self.num_classes}: expected at least 1")
-        check(self)
+        super().__post_init__()
         if self.num_frames * self.points_per_frame > _MOST_POINTS:
             raise UsageError(
                 f"{self.num_frames} frames x {self.points_per_frame} points: expected at most {_MOST_POINTS} points in a clip"

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(Settings):
     """Holds which clips are trained on, which videos validate, and which weights a run starts from.
 
     Raises UsageError where two starts are given.
@@ -50,6 +50,6 @@ class RunSettings:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.static_from and self.init:
             raise UsageError("--init starts both streams, static_from the static one: give one of them")

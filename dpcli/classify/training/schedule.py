@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Settings):
     """Holds the settings of both training stages: epochs, batch, learning rates, regularization, and how clips are computed.
 
     Raises UsageError for values out of range.
@@ -67,7 +67,7 @@ class Schedule:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.video_loss and self.clips_per_video < 2:
             raise UsageError(
                 f"video_loss = true with clips_per_video = {self.clips_per_video}: expected two clips per video or more, such as"

@@ -97,7 +97,7 @@ def predict_stream(task: ModelTask, given: StreamOptions, windows: WindowOptions
     from dpcli.cli.classify.stream_listeners import listener
 
     options = Options(windows.hop or 1, windows.window, follow or 0.0, cloud_files(), reject)
-    run(task, options, lambda speaker: listener(speaker, given.json_output, given.page, task.source))
+    run(task, options, lambda model: listener(model, given.json_output, given.page, task.source))
 
 
 def check_page(page: Path, task: ModelTask) -> None:

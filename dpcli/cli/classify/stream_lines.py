@@ -11,7 +11,7 @@ from dpcli.standard_streams import printable
 if TYPE_CHECKING:
     import numpy as np
 
-    from dpcli.classify.commands.stream import Speaker
+    from dpcli.classify.commands.stream import StreamModel
     from dpcli.classify.stream.sliding_window import Prediction
 
 NOTHING = "nothing happening"
@@ -20,9 +20,9 @@ NOTHING = "nothing happening"
 class Lines:
     """Prints a line per prediction, at once, and one with the whole at the end: JSON or for people."""
 
-    def __init__(self, speaker: Speaker, as_json: bool) -> None:
-        self.class_names, self.streams, self.as_json = speaker.class_names, tuple(speaker.streams), as_json
-        self.confidence = speaker.confidence
+    def __init__(self, model: StreamModel, as_json: bool) -> None:
+        self.class_names, self.streams, self.as_json = model.class_names, tuple(model.streams), as_json
+        self.confidence = model.confidence
         self.count, self.seconds, self.highest = 0, 0.0, 0.0
 
     def see(self, points: np.ndarray, silent: float) -> None:

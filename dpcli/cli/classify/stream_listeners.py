@@ -13,7 +13,7 @@ from dpcli.cli.classify.stream_view import View
 if TYPE_CHECKING:
     import numpy as np
 
-    from dpcli.classify.commands.stream import Listener, Speaker
+    from dpcli.classify.commands.stream import Listener, StreamModel
     from dpcli.classify.stream.sliding_window import Prediction
 
 
@@ -39,20 +39,20 @@ class Several:
             one.finish(mean, frames, clips, end)
 
 
-def listener(speaker: Speaker, as_json: bool, page: Path | None, source: str) -> Several:
+def listener(model: StreamModel, as_json: bool, page: Path | None, source: str) -> Several:
     """Returns what shows the predictions of a stream: a view on a terminal, else lines; and the writer of a page, if asked for."""
-    lines = Lines(speaker, as_json)
+    lines = Lines(model, as_json)
     in_place = sys.stdout.isatty() and os.environ.get("TERM") != "dumb" and not as_json
-    several: list[Listener] = [View(speaker, lines) if in_place else lines]
+    several: list[Listener] = [View(model, lines) if in_place else lines]
     if page is not None:
-        several.append(_page(speaker, page, source))
+        several.append(_page(model, page, source))
     return Several(several)
 
 
-def _page(speaker: Speaker, path: Path, source: str) -> Listener:
+def _page(model: StreamModel, path: Path, source: str) -> Listener:
     from dpcli.classify.segments.live_page import LivePage
     from dpcli.classify.segments.recording import Cutting
     from dpcli.runtime.provenance import command_line
 
-    how = Cutting(speaker.window, speaker.hop, max(1, speaker.window // 2), speaker.confidence)
-    return LivePage(path, source, speaker.class_names, how, command_line())
+    how = Cutting(model.window, model.hop, max(1, model.window // 2), model.confidence)
+    return LivePage(path, source, model.class_names, how, command_line())

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.console import RenderableType
 
-    from dpcli.classify.commands.stream import Speaker
+    from dpcli.classify.commands.stream import StreamModel
     from dpcli.classify.stream.sliding_window import Prediction
 
 _BEST, _BAR, _MEMORY = 5, 30, 400
@@ -26,11 +26,11 @@ _QUIET = 1.0  # seconds without a frame after which the view says that it waits
 class View:
     """Shows the newest prediction in place; at the end the view stays, and the line that `Lines` prints follows."""
 
-    def __init__(self, speaker: Speaker, lines: Lines) -> None:
+    def __init__(self, model: StreamModel, lines: Lines) -> None:
         from rich.live import Live
 
-        self.speaker, self.lines = speaker, lines
-        self.names = [printable(name) for name in speaker.class_names]
+        self.model, self.lines = model, lines
+        self.names = [printable(name) for name in model.class_names]
         self.frames, self.last_seen = 0, time.monotonic()
         self.newest: tuple[np.ndarray, float, int] | None = None  # calibrated probabilities, latency, frames waiting
         self.history: deque[int] = deque(maxlen=_MEMORY)  # class of each prediction, -1 = nothing
@@ -44,10 +44,10 @@ class View:
 
     def write(self, made: Prediction, latency: float, waiting: int) -> None:
         """Takes a prediction to show."""
-        probabilities = self.speaker.confidence.of(made.scores[0])
+        probabilities = self.model.confidence.of(made.scores[0])
         best = int(probabilities.argmax())
         self.newest = probabilities, latency, waiting
-        self.history.append(best if probabilities[best] >= self.speaker.confidence.threshold else -1)
+        self.history.append(best if probabilities[best] >= self.model.confidence.threshold else -1)
         self.lines.count_latency(latency)
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
@@ -65,7 +65,7 @@ class View:
         told = f"frame {self.frames - 1}" + (f", waiting for frames since {silent:.0f} s" if silent > _QUIET else "")
         if self.newest is None:
             return Panel(
-                Text(f"the window of {counted(self.speaker.window, 'frame')} is not full yet"), title=told, width=72
+                Text(f"the window of {counted(self.model.window, 'frame')} is not full yet"), title=told, width=72
             )
         probabilities, latency, waiting = self.newest
         behind = f", {counted(waiting, 'frame')} waiting" if waiting else ""

@@ -21,21 +21,17 @@ class ClassificationStatistics:
     """Holds all that the metrics need of some samples.
 
     confusion: the confusion matrix i64 (C,C), rows truth, columns prediction. top_hits: samples whose true class is
-    among the `top_k` best scores.
+    among the TOP_K best scores.
     """
 
     confusion: np.ndarray
     top_hits: int
-    top_k: int = TOP_K
 
     def __add__(self, other: ClassificationStatistics) -> ClassificationStatistics:
-        """Returns the statistics of both sets of samples together; ValueError for different classes or k."""
-        if self.confusion.shape != other.confusion.shape or self.top_k != other.top_k:
-            raise ValueError(
-                f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes, "
-                f"top {self.top_k} and {other.top_k}"
-            )
-        return ClassificationStatistics(self.confusion + other.confusion, self.top_hits + other.top_hits, self.top_k)
+        """Returns the statistics of both sets of samples together; ValueError for different classes."""
+        if self.confusion.shape != other.confusion.shape:
+            raise ValueError(f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes")
+        return ClassificationStatistics(self.confusion + other.confusion, self.top_hits + other.top_hits)
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class ClassificationMetrics:
 
     accuracy: correct / samples, with `interval` its Wilson interval. balanced_accuracy: mean recall over the classes
     that occur. recall: what papers call per-class accuracy. macro_f1: mean over the classes that occur or were
-    predicted. top_accuracy: truth among the `top_k` best scores; None when there are not more classes than that.
+    predicted. top_accuracy: truth among the TOP_K best scores; None when there are not more classes than that.
     support, predicted, hits: samples of each class, predictions of it, and right ones.
     """
 
@@ -54,7 +50,6 @@ class ClassificationMetrics:
     interval: tuple[float, float]
     balanced_accuracy: float
     macro_f1: float
-    top_k: int
     top_accuracy: float | None
     support: np.ndarray
     predicted: np.ndarray
@@ -74,7 +69,7 @@ def predicted_labels(scores: np.ndarray) -> np.ndarray:
     return np.asarray(scores).argmax(axis=1)
 
 
-def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> ClassificationStatistics:
+def classification_update(scores: np.ndarray, labels: np.ndarray) -> ClassificationStatistics:
     """Returns the statistics of some samples: scores f (S,C), labels i (S) in 0..C-1.
 
     Ties between equal scores go to the lower label, for the best class and for the k best.
@@ -89,7 +84,7 @@ def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = T
     classes = scores.shape[1]
     cells = labels.astype(np.int64) * classes + predicted_labels(scores)
     confusion = np.bincount(cells, minlength=classes * classes).reshape(classes, classes)
-    return ClassificationStatistics(confusion.astype(np.int64), int(top_hits(scores, labels, top_k).sum()), top_k)
+    return ClassificationStatistics(confusion.astype(np.int64), int(top_hits(scores, labels).sum()))
 
 
 def top_hits(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> np.ndarray:
@@ -144,7 +139,7 @@ def classification_compute(statistics: ClassificationStatistics, confidence: flo
     support, predicted, hits = confusion.sum(axis=1), confusion.sum(axis=0), confusion.diagonal()
     samples, correct = int(support.sum()), int(hits.sum())
     recall, f1 = class_recall(hits, support), class_f1(hits, support, predicted)
-    ranked = len(confusion) > statistics.top_k
+    ranked = len(confusion) > TOP_K
     return ClassificationMetrics(
         samples=samples,
         correct=correct,
@@ -152,7 +147,6 @@ def classification_compute(statistics: ClassificationStatistics, confidence: flo
         interval=wilson_interval(correct, samples, confidence),
         balanced_accuracy=mean_defined(recall),
         macro_f1=mean_defined(f1),
-        top_k=statistics.top_k,
         top_accuracy=float(divide(statistics.top_hits, samples)) if ranked else None,
         support=support,
         predicted=predicted,
@@ -164,9 +158,7 @@ def classification_compute(statistics: ClassificationStatistics, confidence: flo
     )
 
 
-def classification_metrics(
-    scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K, confidence: float = 0.95
-) -> ClassificationMetrics:
+def classification_metrics(scores: np.ndarray, labels: np.ndarray, confidence: float = 0.95) -> ClassificationMetrics:
     """Returns the metrics of scores f (S,C) and labels i (S) in 0..C-1. Raises as `classification_update`.
 
     >>> found = classification_metrics(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
@@ -175,13 +167,13 @@ def classification_metrics(
     >>> [round(end, 3) for end in found.interval]
     [0.208, 0.939]
     """
-    return classification_compute(classification_update(scores, labels, top_k), confidence)
+    return classification_compute(classification_update(scores, labels), confidence)
 
 
-def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> WeightedMetric:
+def classification_weighted(scores: np.ndarray, labels: np.ndarray) -> WeightedMetric:
     """Returns the metrics of scores f (S,C) and labels i (S) as functions of how often each sample counts.
 
-    They are accuracy, balanced_accuracy, macro_f1 and, where there are more classes than `top_k`, top-k accuracy.
+    They are accuracy, balanced_accuracy, macro_f1 and, where there are more classes than TOP_K, top-k accuracy.
     """
     classes = scores.shape[1]
     best = predicted_labels(scores)
@@ -192,8 +184,8 @@ def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int =
     sort = np.argsort(order, kind="stable")
     starts = np.searchsorted(order[sort], np.arange(len(cells)))
     shares = {"accuracy": best == labels}
-    if classes > top_k:
-        shares[f"top{top_k}_accuracy"] = top_hits(scores, labels, top_k)
+    if classes > TOP_K:
+        shares[f"top{TOP_K}_accuracy"] = top_hits(scores, labels)
     share_of_samples = means_of_samples({key: hit.astype(np.float64) for key, hit in shares.items()})
 
     def metric(counts: np.ndarray) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
@@ -67,7 +68,7 @@ def _shares(report: ClassificationReport, name: str) -> dict[str, Any]:
     metrics, calibration = report.streams[name], report.calibration.get(name)
     shares: dict[str, Any] = {"accuracy": metrics.accuracy, "accuracy_interval": list(metrics.interval)}
     if metrics.top_accuracy is not None:
-        shares[f"top{metrics.top_k}_accuracy"] = metrics.top_accuracy
+        shares[f"top{TOP_K}_accuracy"] = metrics.top_accuracy
     return shares | {
         "balanced_accuracy": none_if_nan(metrics.balanced_accuracy),
         "macro_f1": none_if_nan(metrics.macro_f1),

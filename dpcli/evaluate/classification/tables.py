@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dpcli.counted import counted
+from dpcli.evaluate.choices import TOP_K
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
@@ -58,7 +59,7 @@ def _stream_table(report: ClassificationReport) -> TextTable:
         "accuracy",
         "correct",
         report.resampling.title,
-        *([f"top-{report.main.top_k}"] if top else []),
+        *([f"top-{TOP_K}"] if top else []),
         "balanced accuracy",
         "macro F1",
         "calibration error",
@@ -86,8 +87,8 @@ def _interval_tables(report: ClassificationReport) -> list[TextTable]:
     """Returns bootstrap intervals of what isn't a share of the samples, and of top-k accuracy; none without resamples."""
     if not report.resampling.resamples:
         return []
-    top = f"top{report.main.top_k}_accuracy"
-    titles = {top: f"top-{report.main.top_k}"} if report.main.top_accuracy is not None else {}
+    top = f"top{TOP_K}_accuracy"
+    titles = {top: f"top-{TOP_K}"} if report.main.top_accuracy is not None else {}
     titles |= {key: title_of(key) for key in ("balanced_accuracy", "macro_f1", "calibration_error")}
     rows = [
         [title, *(percent_ends(own.get(key)) for own in report.intervals.values())] for key, title in titles.items()

@@ -93,18 +93,18 @@ def _measure_scores(path: Path, source: str, options: EvaluationOptions) -> File
     if not asked:
         raise UsageError(f"{source}: top-{TOP_K} accuracy of {len(report.class_names)} classes is always 1")
     return FileMetrics(
-        source,
-        "classification",
-        "samples",
-        report.names,
-        classification_weighted(report.scores, report.labels),
-        {key: hit.astype(np.float64) for key, hit in hits.items() if key in asked},
-        dict.fromkeys(asked, "fraction"),
-        {"split": report.split, "class names": report.class_names},
-        {"true label": report.labels.tolist()},
-        report.left_out,
-        report.provenance,
-        correct,
+        source=source,
+        task="classification",
+        kind="samples",
+        names=report.names,
+        metric=classification_weighted(report.scores, report.labels),
+        per_sample={key: hit.astype(np.float64) for key, hit in hits.items() if key in asked},
+        units=dict.fromkeys(asked, "fraction"),
+        must_equal={"split": report.split, "class names": report.class_names},
+        must_equal_by_sample={"true label": report.labels.tolist()},
+        left_out=report.left_out,
+        provenance=report.provenance,
+        correct=correct,
     )
 
 
@@ -137,17 +137,17 @@ def _of_sequences(
     must_equal_by_sample: dict[str, list],
 ) -> FileMetrics:
     return FileMetrics(
-        source,
-        task,
-        "sequences",
-        report.names,
-        report.metric,
-        _values_of_single_samples(report.metric, len(report.names), units),
-        units,
-        {"split": report.split},
-        must_equal_by_sample,
-        report.left_out,
-        report.provenance,
+        source=source,
+        task=task,
+        kind="sequences",
+        names=report.names,
+        metric=report.metric,
+        per_sample=_values_of_single_samples(report.metric, len(report.names), units),
+        units=units,
+        must_equal={"split": report.split},
+        must_equal_by_sample=must_equal_by_sample,
+        left_out=report.left_out,
+        provenance=report.provenance,
     )
 
 

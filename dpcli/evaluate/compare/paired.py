@@ -82,17 +82,12 @@ class CompareReport:
 
 
 def evaluate_compare(
-    first: Path,
-    second: Path,
-    options: EvaluationOptions,
-    resampling: Resampling,
-    sources: tuple[str, str] | None = None,
+    first: Path, second: Path, options: EvaluationOptions, resampling: Resampling, sources: tuple[str, str]
 ) -> CompareReport:
     """Compares two scores files, parts files or videos with a truth. Raises DataError where they aren't of the same samples.
 
     sources: how the files were named, for messages.
     """
-    sources = sources or (str(first), str(second))
     kinds = [kind_of_file(path, source) for path, source in zip((first, second), sources, strict=True)]
     if kinds[0] != kinds[1]:
         raise DataError(f"{sources[0]}: {kinds[0]}, {sources[1]}: {kinds[1]}; nothing to compare")
@@ -105,7 +100,8 @@ def evaluate_compare(
         for task, one in tasks[0].items()
         if task in tasks[1]
     ]
-    notes = [
+    notes = ["A and B are the same file, so nothing can differ."] if first.samefile(second) else []
+    notes += [
         f"{task.capitalize()}: only {source} can be evaluated, so it isn't compared."
         for source, own, other in zip(sources, tasks, tasks[::-1], strict=True)
         for task in own

@@ -104,7 +104,7 @@ def mean_with_t_interval(values: Sequence[float], confidence: float = 0.95, shar
 
 
 def evaluate_runs(
-    paths: Sequence[Path], options: EvaluationOptions, confidence: float = 0.95, sources: Sequence[str] | None = None
+    paths: Sequence[Path], options: EvaluationOptions, confidence: float, sources: Sequence[str]
 ) -> RunsReport:
     """Evaluates several files in the same way: scores files, parts files, or files of JSON objects, one a line, that
     `dpc evaluate ... --json` printed.
@@ -113,7 +113,7 @@ def evaluate_runs(
     """
     runs = [
         run
-        for path, source in zip(paths, sources or map(str, paths), strict=True)
+        for path, source in zip(paths, sources, strict=True)
         for run in (_file_runs if is_media(path) or is_hdf5(path) else _json_runs)(path, source, options)
     ]
     for run in runs[1:]:
@@ -194,14 +194,14 @@ def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
         "denominators": {key: counts[key] for key in _COUNTS if key in counts},
     }
     return Run(
-        _title(own, source),
-        source,
-        str(own.get("task", "")),
-        metrics,
-        {key: str(own["units"][key]) for key in metrics},
-        identity,
-        notes,
-        _seed(own),
+        title=_title(own, source),
+        source=source,
+        task=str(own.get("task", "")),
+        metrics=metrics,
+        units={key: str(own["units"][key]) for key in metrics},
+        identity=identity,
+        notes=notes,
+        seed=_seed(own),
     )
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric, ratios_of_sums, values_of_all
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Resampling, WeightedMetric, ratios_of_sums, values_of_all
 from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
 from dpcli.evaluate.joints.visibility import VISIBLE, joint_visibility
-from dpcli.evaluate.results import LeftOut, measure_by_class
+from dpcli.evaluate.results import Report, measure_by_class
 from dpcli.evaluate.segmentation.truth_pairing import PairedSequences
 from dpcli.store import CloudSequence, CloudsReader
 
@@ -29,8 +29,8 @@ METRICS = (
 )
 
 
-@dataclass
-class JointReport:
+@dataclass(kw_only=True)
+class JointReport(Report):
     """Holds the metrics of all sequences and of those of each label.
 
     metrics: shares 0..1 (type, axis_within_5, the same of visible joints, edge_f1), degrees (axis_angle, state_angle) and
@@ -38,19 +38,13 @@ class JointReport:
     """
 
     split: str
-    truth: str
     length_unit: str
     metrics: dict[str, float]
     classes: dict[int, dict[str, float]]
     class_names: list[str]
-    left_out: list[LeftOut]
-    names: list[str]
     total: JointStatistics
     counts: dict[int, JointStatistics]
-    resampling: Resampling
-    intervals: dict[str, Interval]
     poses: bool
-    provenance: list[dict]
 
 
 def evaluate_joints(
@@ -82,20 +76,20 @@ def evaluate_joints(
         raise DataError(f"{truth}: no joint between two parts that are seen; nothing to compare")
     counts = measure_by_class(labels, found, lambda own: sum(own, JointStatistics()))
     return JointReport(
-        paired.split,
-        str(truth),
-        paired.truth.length_unit,
-        joint_metrics(total),
-        {label: joint_metrics(one) for label, one in counts.items()},
-        paired.truth.class_names,
-        paired.left_out,
-        names,
-        total,
-        counts,
-        resampling,
-        resampling.intervals(_weighted(found), len(found)),
-        "pose" in paired.truth.fields,
-        paired.predicted.provenance,
+        names=names,
+        split=paired.split,
+        truth=str(truth),
+        length_unit=paired.truth.length_unit,
+        metrics=joint_metrics(total),
+        classes={label: joint_metrics(one) for label, one in counts.items()},
+        class_names=paired.truth.class_names,
+        total=total,
+        counts=counts,
+        poses="pose" in paired.truth.fields,
+        resampling=resampling,
+        intervals=resampling.intervals(_weighted(found), len(found)),
+        left_out=paired.left_out,
+        provenance=paired.predicted.provenance,
     )
 
 

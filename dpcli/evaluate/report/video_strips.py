@@ -28,7 +28,7 @@ def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", backgro
     chosen = video_protocol(protocol, background)
     strip = DifferenceStrip(BACKGROUNDS[chosen.background])
     with closing(open_source(truth)) as true_source, closing(open_source(predicted, truth=true_source)) as source:
-        pairs = match_views(source, true_source, chosen, True, [])
+        pairs, _ = match_views(source, true_source, chosen, intersect=True)
         for ours, theirs in pairs[:_MOST_VIEWS]:
             count = min(one.frames[view] for one, view in ((source, ours), (true_source, theirs)) if one.frames)
             shown = spread_evenly(count, _INSTANTS)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut, left_out, measure_by_class, merge_statistics
+from dpcli.evaluate.results import Report, left_out, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.motion_metrics import (
     MAIN_TAU,
     RELEASE_BATCH,
@@ -37,31 +37,25 @@ from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequenceP
 from dpcli.store.schema import METERS
 
 
-@dataclass
-class MotionReport:
+@dataclass(kw_only=True)
+class MotionReport(Report):
     """Holds the metrics of all sequences, and of those of each label that occurs.
 
-    names, pairs: each sequence that counts and its frame pairs i (Q,2). metric: of how often each counts. intervals: by
-    metric (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true
-    flow is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
+    pairs: the frame pairs i (Q,2) of each sequence that counts. metric: of how often each counts (part_rotation in degrees;
+    see `motion_weighted`). from_poses: false when the true flow is the field `scene_flow`; without_truth then counts the
+    predicted pairs that it doesn't tell of.
     """
 
     protocol: str
     split: str
-    truth: str
     length_unit: str
     main: MotionMetrics
     classes: dict[int, MotionMetrics]
     class_names: list[str]
-    left_out: list[LeftOut]
-    names: list[str]
     pairs: list[np.ndarray]
     metric: WeightedMetric
-    resampling: Resampling
-    intervals: dict[str, Interval]
     from_poses: bool
     without_truth: int
-    provenance: list[dict]
 
 
 def evaluate_motion(
@@ -109,24 +103,20 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
     batch = RELEASE_BATCH if protocol == "release" else None
     metric = motion_weighted(statistics, MAIN_TAU[protocol], batch)
     return MotionReport(
-        protocol,
-        counted.about["split"],
-        counted.about["truth"],
-        counted.length_unit,
-        motion_compute(merge_statistics(statistics), batch),
-        measure_by_class(
+        **counted.facts(),
+        length_unit=counted.length_unit,
+        main=motion_compute(merge_statistics(statistics), batch),
+        classes=measure_by_class(
             [row["label"] for _, row in found], statistics, lambda own: motion_compute(merge_statistics(own), batch)
         ),
-        counted.class_names,
-        [*counted.left_out, *left_out({reason: without_pairs})],
-        [name for name, _ in found],
-        [row["pairs"] for _, row in found],
-        metric,
-        resampling,
-        resampling.intervals(metric, len(statistics)),
-        from_poses,
-        without_truth,
-        counted.provenance,
+        names=[name for name, _ in found],
+        left_out=[*counted.left_out, *left_out({reason: without_pairs})],
+        pairs=[row["pairs"] for _, row in found],
+        metric=metric,
+        resampling=resampling,
+        intervals=resampling.intervals(metric, len(statistics)),
+        from_poses=from_poses,
+        without_truth=without_truth,
     )
 
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, WeightedMetric
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Resampling, WeightedMetric
 from dpcli.evaluate.choices import check_protocol
-from dpcli.evaluate.results import LeftOut, measure_by_class, merge_statistics
+from dpcli.evaluate.results import Report, measure_by_class, merge_statistics
 from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
@@ -41,27 +41,21 @@ FIXES = (
 )
 
 
-@dataclass
-class SegmentationReport:
+@dataclass(kw_only=True)
+class SegmentationReport(Report):
     """Holds the metrics of all sequences, and of those of each label that occurs; `objects` has what pictures need.
 
-    names: the sequences that count. metric: of how often each counts. intervals: by metric, empty without `resampling`.
+    metric: of how often each sequence counts.
     """
 
     protocol: str
     ignore_below: int
     split: str
-    truth: str
     main: SegmentationMetrics
     objects: SegmentationStatistics
     classes: dict[int, SegmentationMetrics]
     class_names: list[str]
-    left_out: list[LeftOut]
-    names: list[str]
     metric: WeightedMetric
-    resampling: Resampling
-    intervals: dict[str, Interval]
-    provenance: list[dict]
 
 
 def evaluate_segmentation(
@@ -103,20 +97,16 @@ def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> 
         raise DataError(f"{about['truth']}: not one frame has a true part{of_size}")
     metric = segmentation_weighted(sequences, protocol)
     return SegmentationReport(
-        protocol,
-        ignore_below,
-        about["split"],
-        about["truth"],
-        segmentation_compute(whole, protocol),
-        whole,
-        measure_by_class(labels, sequences, lambda own: segmentation_compute(merge_statistics(own), protocol)),
-        counted.class_names,
-        counted.left_out,
-        counted.names,
-        metric,
-        resampling,
-        resampling.intervals(metric, len(sequences)),
-        counted.provenance,
+        **counted.facts(),
+        ignore_below=ignore_below,
+        main=segmentation_compute(whole, protocol),
+        objects=whole,
+        classes=measure_by_class(labels, sequences, lambda own: segmentation_compute(merge_statistics(own), protocol)),
+        names=counted.names,
+        left_out=counted.left_out,
+        metric=metric,
+        resampling=resampling,
+        intervals=resampling.intervals(metric, len(sequences)),
     )
 
 

@@ -64,6 +64,11 @@ class Counted:
         """Returns the samples that don't count."""
         return [LeftOut(reason, names) for reason, names in self.about["left_out"]]
 
+    def facts(self) -> dict[str, Any]:
+        """Returns what reports of segmentation and of motion say alike of how the sequences were counted."""
+        choices = {key: self.about[key] for key in ("protocol", "split", "truth")}
+        return {**choices, "class_names": self.class_names, "provenance": self.provenance}
+
 
 def statistics_of(kind: type[Statistics], rows: Iterable[dict[str, Any]], path: str | Path) -> list[Statistics]:
     """Returns the statistics of sequences, of a dataclass, from their rows. Raises DataError where a kept file has other fields."""

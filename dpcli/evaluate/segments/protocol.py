@@ -8,9 +8,9 @@ from typing import Any
 
 from dpcli.counted import counted
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import NO_INTERVALS, Interval, Resampling, values_of_all
+from dpcli.evaluate.bootstrap import NO_INTERVALS, Resampling, values_of_all
 from dpcli.evaluate.metric_titles import title_of
-from dpcli.evaluate.results import LeftOut, left_out, left_out_note, list_names, none_if_nan, report_json
+from dpcli.evaluate.results import LeftOut, Report, left_out, left_out_note, list_names, none_if_nan, report_json
 from dpcli.evaluate.segments.metrics import METRICS, OVERLAPS, RecordingCounts, count_recording, segments_weighted
 from dpcli.evaluate.segments.truth_check import check_classes, doubts_of_frames
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
@@ -24,18 +24,12 @@ _NOTE = (
 )
 
 
-@dataclass(frozen=True)
-class SegmentsReport:
-    """Holds the metrics (0..1, NaN = undefined) of some recordings, the counts of each, and what was left out."""
+@dataclass(kw_only=True)
+class SegmentsReport(Report):
+    """Holds the metrics (0..1, NaN = undefined) of some recordings, and the counts of each."""
 
-    names: list[str]
     counts: list[RecordingCounts]
     metrics: dict[str, float]
-    intervals: dict[str, Interval]
-    resampling: Resampling
-    truth: str
-    left_out: list[LeftOut]
-    provenance: list[dict]
 
 
 def evaluate_segments(
@@ -52,9 +46,16 @@ def evaluate_segments(
         log.warn(f"{truth}: {doubt}")
     counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
     metric = segments_weighted(counts)
-    intervals = resampling.intervals(metric, len(counts))
-    values = values_of_all(metric, len(counts))
-    return SegmentsReport(names, counts, values, intervals, resampling, truth, others, predicted.provenance)
+    return SegmentsReport(
+        names=names,
+        counts=counts,
+        metrics=values_of_all(metric, len(counts)),
+        truth=truth,
+        resampling=resampling,
+        intervals=resampling.intervals(metric, len(counts)),
+        left_out=others,
+        provenance=predicted.provenance,
+    )
 
 
 def _one_sided(predicted: Segments, true: Segments, names: Sequence[str], truth: str, intersect: bool) -> list[LeftOut]:

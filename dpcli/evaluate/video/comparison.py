@@ -19,6 +19,7 @@ from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.video.frame_pass import FramePass, ViewScore, Watch
 from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.learned.loading import load_metrics
+from dpcli.evaluate.video.mistakes import Mistakes
 from dpcli.evaluate.video.protocol import VideoProtocol, video_protocol
 from dpcli.evaluate.video.sources.open_source import open_source
 from dpcli.evaluate.video.sources.source import Source
@@ -92,28 +93,28 @@ def evaluate_video(
     with closing(open_source(Path(truth))) as real, closing(open_source(Path(path), truth=real)) as predicted:
         names = _choose_metrics(metrics, predicted, real)
         pictured = [name for name in names if name in PICTURE_METRICS]
-        left_out: list[LeftOut] = []
-        pairs = match_views(predicted, real, chosen, intersect, left_out) if pictured else []
-        frames = FramePass(predicted, real, chosen, pictured, intersect, watch or (lambda *_: None), left_out)
+        pairs, left_out = match_views(predicted, real, chosen, intersect) if pictured else ([], [])
+        mistakes = Mistakes(predicted, real, chosen)
+        frames = FramePass(predicted, real, chosen, pictured, intersect, watch or (lambda *_: None), left_out, mistakes)
         views = frames.score_views(pairs)
         learned_names = [name for name in names if name in LEARNED_METRICS]
         if weights is not None and not set(learned_names) - {"warping"}:
             log.warn(f"--weights {weights}: nothing in it is read; none of the metrics asked for needs a network")
         learned, missing = _learned_scores(frames, learned_names, folder, device)
         report = VideoReport(
-            chosen,
-            tuple(names),
-            str(truth),
-            frames.size,
-            views,
-            left_out,
-            frames.notes(),
-            learned,
-            missing,
-            _scene_scores(predicted, real, names, seed),
-            real.header.length_unit if real.header else "",
-            list(predicted.provenance),
-            resampling,
+            protocol=chosen,
+            names=tuple(names),
+            truth=str(truth),
+            size=frames.size,
+            views=views,
+            left_out=left_out,
+            notes=frames.notes(),
+            learned=learned,
+            missing=missing,
+            scene=_scene_scores(predicted, real, names, seed),
+            length_unit=real.header.length_unit if real.header else "",
+            provenance=list(predicted.provenance),
+            resampling=resampling,
         )
         report.intervals = _intervals(report)
         return report
@@ -136,12 +137,11 @@ def _learned_scores(
         return {}, {}
     made, missing = load_metrics(names, frames.protocol.networks, folder, device)
     others = replace(frames.protocol, views=frames.protocol.learned_views or frames.protocol.views)
-    second = replace(frames, left_out=[], hollow=0)
+    second = replace(frames, left_out=[], damaged=[])
     if made:
-        pairs = match_views(frames.predicted, frames.truth, others, frames.intersect, second.left_out)
+        pairs, second.left_out = match_views(frames.predicted, frames.truth, others, frames.intersect)
         second.feed(pairs, made, missing)
-    frames.size, frames.misnumbered, frames.swapped = second.size, second.misnumbered, second.swapped
-    frames.hollow = frames.hollow or second.hollow
+    frames.size = second.size
     frames.left_out.extend(entry for entry in second.left_out if entry not in frames.left_out)  # each is said once
     scores = {}
     for name, metric in made.items():

@@ -15,12 +15,11 @@ _SAME_CAMERA = 1e-4  # relative: cameras that went through float32 still are the
 
 
 def match_views(
-    predicted: Source, truth: Source, protocol: VideoProtocol, intersect: bool, others: list[LeftOut]
-) -> list[tuple[int, int]]:
-    """Returns (view of the prediction, view of the truth) of what is compared, in the truth's order.
+    predicted: Source, truth: Source, protocol: VideoProtocol, intersect: bool
+) -> tuple[list[tuple[int, int]], list[LeftOut]]:
+    """Returns (view of the prediction, view of the truth) of what is compared, in the truth's order, and views that aren't.
 
-    The protocol says which views of the truth; those of either side that aren't go to `others`. Raises DataError when one lacks a
-    partner and `intersect` is off, or none has.
+    The protocol says which views of the truth. Raises DataError when one lacks a partner and `intersect` is off, or none has.
     """
     compared = [i for i, view in enumerate(truth.views) if protocol.views in ("all", view.role)]
     if not compared and protocol.views == "test" or len(truth.views) == 1:
@@ -46,7 +45,6 @@ def match_views(
         raise DataError(
             f"{truth.path}: has no view {list_names(unknown)}, which {predicted.path} has; --intersect compares what both have"
         )
-    others += left_out({"views not predicted": not_predicted, "views the truth doesn't have": unknown})
     pairs = [(partners[i], i) for i in compared if partners[i] is not None]
     if not pairs:
         raise DataError(
@@ -55,7 +53,7 @@ def match_views(
         )
     if not intersect:
         _check_cameras(predicted, truth, pairs)
-    return pairs
+    return pairs, left_out({"views not predicted": not_predicted, "views the truth doesn't have": unknown})
 
 
 def _partner_view(predicted: Source, truth: Source, index: int) -> int | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -47,8 +46,8 @@ def train_shape_prior(
     """
     check_sizes(settings)
     where = choose_device(device)
-    record = {name: asdict(group) for name, group in settings._asdict().items()}
-    record = json.loads(json.dumps({**record, "seed": seed, **models}))
+    groups = {name: asdict(group) for name, group in settings._asdict().items()}
+    record: dict[str, Any] = {**groups, "seed": seed, **models}
     if settings.data.init is not None:
         record["init_weights"] = provenance.file_digest(find_shape_model(settings.data.init))
     folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)

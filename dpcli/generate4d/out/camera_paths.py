@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.generate4d.render_settings import Path
+from dpcli.generate4d.render_settings import CameraPath
 from dpcli.ops.cameras import orbit_of, orbit_pose, pinhole
 from dpcli.store.gaussians import GaussianScene
 
@@ -126,7 +126,7 @@ def clip_rate(scene: GaussianScene) -> float:
     return float(np.clip(own_rate(scene), 1, 60))
 
 
-def default_rate(scene: GaussianScene, path: Path) -> float:
+def default_rate(scene: GaussianScene, path: CameraPath) -> float:
     """Returns the pictures per second of a video: `clip_rate`, or a whole multiple of at least 24 where the camera moves."""
     rate = clip_rate(scene)
     return rate if path in ("fixed", "reference") else rate * math.ceil(_SMOOTH / rate - 1e-6)
@@ -134,7 +134,7 @@ def default_rate(scene: GaussianScene, path: Path) -> float:
 
 def plan_shots(
     scene: GaussianScene,
-    path: Path = "turntable",
+    path: CameraPath = "turntable",
     lens: Lens = Lens(),
     *,
     frames: int | None = None,

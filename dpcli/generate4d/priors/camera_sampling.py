@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpcli.generate4d.priors.interface import RelativeCamera
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 
@@ -14,8 +15,8 @@ _ELEVATION = np.deg2rad(30.0)  # offsets drawn from +-30 degrees, azimuth from a
 
 def novel_cameras(
     targets: Targets, count: int, size: int, rng: torch.Generator
-) -> tuple[list[tuple[float, float, float]], Tensor, Tensor]:
-    """Returns random cameras: offsets (azimuth, elevation, radius) from the reference, poses and intrinsics f32.
+) -> tuple[list[RelativeCamera], Tensor, Tensor]:
+    """Returns random cameras, by their offsets from the reference, and their poses and intrinsics f32.
 
     The poses are world_to_camera (count,4,4), the intrinsics (count,3,3) are of square pictures of `size` pixels.
     """

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dpcli.runtime.settings.fields import WIDEST, check, setting
+from dpcli.runtime.settings.fields import WIDEST, Settings, setting
 from dpcli.runtime.settings.stored import StoredConfig
 
 
 @dataclass(frozen=True)
-class ShapeConfig(StoredConfig):
+class ShapeConfig(StoredConfig, Settings):
     """Holds the sizes of a shape network."""
 
     widths: tuple[int, ...] = setting(
@@ -21,6 +21,3 @@ class ShapeConfig(StoredConfig):
     hidden: int = setting(128, "Width of the layers that predict the angles.", least=1, most=WIDEST)
     bins: int = setting(15, "Bins of each angle.", least=2, most=360)
     lengths: bool = setting(False, "Whether the length along the line of sight is predicted, too, in as many bins.")
-
-    def __post_init__(self) -> None:
-        check(self)

@@ -1,11 +1,8 @@
 """Settings written once, as fields of frozen dataclasses with help, legal values and default.
 
     @dataclass(frozen=True)
-    class Schedule:
+    class Schedule(Settings):
         batch: int = setting(16, "Clips per step.", least=1)
-
-        def __post_init__(self) -> None:
-            check(self)
 
 `runtime/settings/catalog.py` joins the dataclasses of one command and reads what a user changes.
 """
@@ -137,12 +134,14 @@ def settings_of(cls: type) -> tuple[Setting, ...]:
     return tuple(found)
 
 
-def check(instance: Any) -> None:
-    """Raises UsageError when a setting of the dataclass instance has a wrong type, word or range; for `__post_init__`."""
-    for one in settings_of(type(instance)):
-        value = getattr(instance, one.field)
-        if one.checked(value) != value:  # a list, which a file may have for a tuple
-            raise one.refused(value)
+class Settings:
+    """Makes a dataclass that derives from it raise UsageError for a setting of a wrong type, word or range."""
+
+    def __post_init__(self) -> None:
+        for one in settings_of(type(self)):
+            value = getattr(self, one.field)
+            if one.checked(value) != value:  # a list, which a file may have for a tuple
+                raise one.refused(value)
 
 
 def nearest(word: str, legal: Iterable[str]) -> str | None:

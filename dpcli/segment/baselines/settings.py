@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 _SHARED = ("motion", "max_parts", "smallest_cluster", "max_points")
 METHODS = {  # and what each reads beside the shared settings
@@ -21,7 +21,7 @@ _FEWEST = {"ssc": 2, "trajaffn": 1}
 
 
 @dataclass(frozen=True)
-class ClassicalSettings:
+class ClassicalSettings(Settings):
     """Holds the method and the settings of the classical ones. Lengths are in diameters of the object.
 
     dbscan: Ester et al., KDD 1996. ward: Ward, JASA 1963. ssc: sparse subspace clustering, Elhamifar and Vidal, TPAMI
@@ -71,7 +71,7 @@ class ClassicalSettings:
 
     def __post_init__(self) -> None:
         """Raises UsageError for a wrong value, or a setting that belongs to another method."""
-        check(self)
+        super().__post_init__()
         if self.method in ("ssc", "trajaffn") and self.motion == "none":
             raise UsageError(f"motion = none: --method {self.method} sees only motion; expected flow or residual")
         legal = ("method", "parts", *_SHARED, *METHODS[self.method]) if self.classical else ("method",)

@@ -47,9 +47,8 @@ class FlowOfSequence:
             return [name for name in given if name == "time"]
         return [*(name for name in given if name != "scene_flow"), "scene_flow"]
 
-    def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
-        """Returns some points of each frame of a sequence, and their flow; its number in the file changes nothing."""
-        _, sequence = numbered
+    def __call__(self, sequence: CloudSequence) -> CloudSequence:
+        """Returns some points of each frame of a sequence, and their flow."""
         if self.flow not in METHODS:
             choose_device(self.device)  # a worker multiplies matrices by the library that the command itself chose
         drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS))
@@ -181,8 +180,8 @@ def _estimate_sequences(
         writer.write(sequence)
         return {"frames": sequence.num_frames}
 
-    def load(place: int) -> tuple[int, CloudSequence]:
-        return chosen[place], reader.read(chosen[place], fields=read)
+    def load(place: int) -> CloudSequence:
+        return reader.read(chosen[place], fields=read)
 
     names, words = [reader.names[i] for i in chosen], Wording("segment estimate-flow", "sequence", "estimated")
     taken = ItemPass(writer, names, words, spread.shard)

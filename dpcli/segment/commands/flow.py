@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,7 +35,7 @@ def train_flow_estimator(
             "seed": seed,
             "data": provenance.file_digest(path),
         }
-        folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_flow_curves)
+        folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_flow_curves)
         log.info(
             f"training a flow estimator on {chosen}: {len(reader)} sequences, {schedule.steps} steps of"
             f" {schedule.batch} pairs"

@@ -70,9 +70,8 @@ class PartsOfSequence:
     seed: int
     length_unit: str
 
-    def __call__(self, numbered: tuple[int, CloudSequence]) -> tuple[CloudSequence, PartsSample]:
-        """Returns a sequence with its parts, and what else is said of it; its number in the file changes nothing."""
-        _, sequence = numbered
+    def __call__(self, sequence: CloudSequence) -> tuple[CloudSequence, PartsSample]:
+        """Returns a sequence with its parts, and what else is said of it."""
         segmenter = self.segmenter.get()
         estimate = partial(estimate_flow_both_ways, method=self.flow, device=self.device)
         if isinstance(segmenter, SceneSegmenter):
@@ -269,8 +268,8 @@ def _predict_sequences(
         writer.write(sequence, sample.probability, sample.pairs, sample.motion, sample.flow)
         return {"frames": sequence.num_frames}
 
-    def load(place: int) -> tuple[int, CloudSequence]:
-        return sequences[place], reader.read(sequences[place], fields=fields)
+    def load(place: int) -> CloudSequence:
+        return reader.read(sequences[place], fields=fields)
 
     names = [reader.names[index] for index in sequences]
     taken = ItemPass(writer, names, Wording("segment predict", "sequence", "divided"), spread.shard)
@@ -297,11 +296,11 @@ def _close(target: Path, drawings: Drawings, scene: bool) -> int:
         for line in skipped_lines(made.skipped):
             log.warn(line)
         if len(made):
-            _draw(target, drawings, scene)
+            _draw(made, drawings, scene)
         return len(made)
 
 
-def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
+def _draw(reader: PartsReader, drawings: Drawings, scene: bool) -> None:
     """Draws what was just written; scenes from above."""
     if drawings == Drawings():
         return
@@ -309,18 +308,17 @@ def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
     from dpcli.segment.pictures import parts_picture, turntable, usual_look
     from dpcli.segment.scene.report import picture_of_scene
 
-    with PartsReader(target) as reader:
-        if drawings.picture is not None:
-            shown = spread_places(len(reader), _ROWS)
-            sequences, look = [reader.read(int(i)) for i in shown], usual_look(reader.provenance)
-            if scene:
-                sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
-                look = looks[0]
-            parts_picture(drawings.picture, sequences, look=look)
-            if len(shown) < len(reader):
-                log.info(f"{drawings.picture}: shows {len(shown)} of {len(reader)} sequences, evenly chosen")
-        if drawings.turntable is not None:
-            turntable(drawings.turntable, reader.read(0), look=usual_look(reader.provenance, 320))
-        if drawings.ply is not None:
-            for index, name in enumerate(file_names(reader.names)):
-                write_ply_frames(drawings.ply / name, reader.read(index))
+    if drawings.picture is not None:
+        shown = spread_places(len(reader), _ROWS)
+        sequences, look = [reader.read(int(i)) for i in shown], usual_look(reader.provenance)
+        if scene:
+            sequences, looks = zip(*(picture_of_scene(one, reader.length_unit) for one in sequences))
+            look = looks[0]
+        parts_picture(drawings.picture, sequences, look=look)
+        if len(shown) < len(reader):
+            log.info(f"{drawings.picture}: shows {len(shown)} of {len(reader)} sequences, evenly chosen")
+    if drawings.turntable is not None:
+        turntable(drawings.turntable, reader.read(0), look=usual_look(reader.provenance, 320))
+    if drawings.ply is not None:
+        for index, name in enumerate(file_names(reader.names)):
+            write_ply_frames(drawings.ply / name, reader.read(index))

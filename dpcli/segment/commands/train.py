@@ -93,7 +93,7 @@ def _describe_run(
     path: Path, config: PartConfig, settings: TrainSettings, seed: int, mixed: bool, used: dict[str, Path]
 ) -> dict[str, Any]:
     """Returns what must be equal for a run to be continued; files by their digests, since what a path leads to may change."""
-    record = {
+    return {
         "network": json.loads(config.to_json()),
         "schedule": asdict(settings.schedule),
         "objective": asdict(settings.objective),
@@ -105,7 +105,6 @@ def _describe_run(
         **{role: provenance.file_digest(file) for role, file in used.items()},
         **({"amp": True} if mixed else {}),
     }
-    return json.loads(json.dumps(record))
 
 
 def _check_flows(

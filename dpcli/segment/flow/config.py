@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import WIDEST, check, setting
+from dpcli.runtime.settings.fields import WIDEST, Settings, setting
 from dpcli.runtime.settings.stored import StoredConfig
 
 
 @dataclass(frozen=True)
-class FlowConfig(StoredConfig):
+class FlowConfig(StoredConfig, Settings):
     """Holds the widths and neighborhoods of a flow network; defaults are `compact`, ours, for training on a CPU.
 
     Lengths are in diameters of the object.
@@ -37,20 +37,14 @@ class FlowConfig(StoredConfig):
     norm: Literal["layer", "batch"] = setting("layer", "Normalization of the layers.")
     support: float = setting(10.0, "Largest distance of the global match, in diameters.", above=0)
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True)
-class FlowSchedule:
+class FlowSchedule(Settings):
     """Holds how long a flow network learns."""
 
     steps: int = setting(2000, "Steps of the optimizer.", least=1)
     batch: int = setting(8, "Pairs per step.", least=1)
     points: int = setting(512, "Points of each frame that the network sees in training.", least=32)
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 def release() -> FlowConfig:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class MultibodySettings:
+class MultibodySettings(Settings):
     """Holds the weights of the energy that all bodies of a sequence share, and how far the search for them goes.
 
     Costs are in units of one point whose residuals are all at their worst.
@@ -44,6 +44,3 @@ class MultibodySettings:
         "bodies are split.",
         least=0,
     )
-
-    def __post_init__(self) -> None:
-        check(self)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from dpcli.errors import UsageError
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 from dpcli.runtime.settings.stored import StoredConfig
 from dpcli.runtime.settings.value_types import numbers_in
 
@@ -20,7 +20,7 @@ _POSITIVE = (
 
 
 @dataclass(frozen=True)
-class NetworkSettings:
+class NetworkSettings(Settings):
     """Holds what a user chooses of the network; `config` makes the sizes of it."""
 
     sizes: Literal["compact", "release"] = setting(
@@ -35,9 +35,6 @@ class NetworkSettings:
     slots: int = setting(8, "Most parts that a frame can be divided into.", least=2, most=1000)
     points: int = setting(512, "Points of each frame that the network sees.", least=32)
 
-    def __post_init__(self) -> None:
-        check(self)
-
     def config(self) -> PartConfig:
         """Returns the sizes of the network that these settings describe."""
         chosen = {"group": self.group, "pooling": self.pooling, "slots": self.slots, "points": self.points}
@@ -46,15 +43,12 @@ class NetworkSettings:
 
 
 @dataclass(frozen=True)
-class Precision:
+class Precision(Settings):
     """Holds whether the network works in mixed precision."""
 
     amp: bool | None = setting(
         None, "Matrix products in bfloat16, geometry in float32; none: on GPUs that have it (Ampere and later)."
     )
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 @dataclass(frozen=True)

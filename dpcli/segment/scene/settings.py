@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(Settings):
     """Holds how far things move, and what counts as evidence that one does. Lengths are meters."""
 
     max_objects: int = setting(31, "--scene: most moving objects of a sequence; the largest are kept.", least=1)
@@ -18,6 +18,3 @@ class SceneSettings:
     evidence: float = setting(
         8.0, "--scene: points that a motion of its own must explain better before an object counts as moving.", above=0
     )
-
-    def __post_init__(self) -> None:
-        check(self)

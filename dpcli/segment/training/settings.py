@@ -8,12 +8,12 @@ from typing import Literal, NamedTuple
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting, settings_of
+from dpcli.runtime.settings.fields import Settings, setting, settings_of
 from dpcli.segment.network.config import NETWORK_PRESETS, NetworkSettings, Precision
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(Settings):
     """Holds what a training starts from, and what it keeps apart to judge itself."""
 
     flow: str = setting(
@@ -29,12 +29,9 @@ class RunSettings:
         " training sequences, or class names with commas.",
     )
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Settings):
     """Holds how long and how fast a network learns. A pair gives two frames to each step."""
 
     epochs: int = setting(10, "Epochs; each passes over pairs_per_epoch pairs.", least=1)
@@ -47,9 +44,6 @@ class Schedule:
     augment: bool = setting(True, "Turn every pair at random.")
     validation_pairs: int = setting(48, "Most pairs of the held-out sequences that are looked at.", least=1)
 
-    def __post_init__(self) -> None:
-        check(self)
-
     def learning_rate_at(self, step: int, steps: int) -> float:
         """Returns the learning rate of one step (from 0) of `steps`."""
         warm = max(1, min(100, steps // 10))
@@ -59,7 +53,7 @@ class Schedule:
 
 
 @dataclass(frozen=True)
-class Objective:
+class Objective(Settings):
     """Holds the weights and switches of the loss (thesis 4.4.4). Times are fractions of the whole training."""
 
     form: Literal["blended", "per-part"] = setting(
@@ -87,9 +81,6 @@ class Objective:
     consensus_after: float = setting(0.5, "Fraction of the training before consensus weighs; above 1: never.", least=0)
     update_after: float = setting(0.4, "Fraction of the training before flows are corrected; above 1: never.", least=0)
     smooth_after: float = setting(0.03, "Fraction of the training before smoothness counts; above 1: never.", least=0)
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 class TrainSettings(NamedTuple):

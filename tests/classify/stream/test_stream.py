@@ -22,7 +22,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import Speaker, _IrregularFrames
+from dpcli.classify.commands.stream import StreamModel, _IrregularFrames
 from dpcli.classify.confidence import Confidence
 from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, uniform_frames
 from dpcli.classify.network.config import KinetConfig
@@ -602,7 +602,7 @@ def test_nothing_happens_below_the_threshold_and_scores_stay(model_file, tmp_pat
 
 def test_lines_tell_the_confidence_that_the_threshold_is_held_against(capsys):
     """Plain probabilities would contradict the verdict: here the larger of two is rejected and the smaller one is not."""
-    lines = Lines(Speaker(["wave", "bow", "sit"], ["static"], Confidence(0.5, 0.6), 4, 1), False)
+    lines = Lines(StreamModel(["wave", "bow", "sit"], ["static"], Confidence(0.5, 0.6), 4, 1), False)
     for row in ([0.5, 0.48, 0.02], [0.48, 0.26, 0.26]):
         scores = np.array([row, row], np.float32)
         lines.write(Prediction(7, 1, scores, scores), 0.05, 0)

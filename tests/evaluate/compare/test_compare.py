@@ -229,7 +229,9 @@ def test_other_samples_are_named_or_left_out(run, scores, parts, tmp_path):
         run("compare", parts["good"], parts["fewer"], *options)
     found = json.loads(run("compare", parts["fewer"], parts["good"], *options, "--intersect", "--json"))
     assert found["denominators"]["segmentation"] == {"sequences": 6} and "s0" in json.dumps(found["left_out"])
-    only = json.loads(run("compare", parts["fewer"], parts["fewer"], *options, "--intersect", "--json"))["metrics"]
+    told = json.loads(run("compare", parts["fewer"], parts["fewer"], *options, "--intersect", "--json"))
+    only = told["metrics"]
+    assert told["notes"][0] == "A and B are the same file, so nothing can differ."
     assert found["metrics"]["miou"]["a"] == only["miou"]["a"]
 
 

@@ -191,6 +191,8 @@ def test_colors_that_were_multiplied_by_alpha_are_noticed(kind, tmp_path: Path) 
     for pair, side in (("ba", "prediction"), ("ab", "truth"), ("aa", ""), ("bb", ""), ("ca", ""), ("ac", "")):
         notes = " ".join(evaluate_video(*(paths[name] for name in pair), metrics=("psnr",)).notes)
         assert (f"multiplied by alpha in the {side} (" in notes) if side else "multiplied" not in notes, pair
+    learned_alone = evaluate_video(paths["b"], paths["a"], metrics=("warping",)).notes
+    assert any("multiplied by alpha in the prediction (" in note for note in learned_alone)
 
 
 def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> None:

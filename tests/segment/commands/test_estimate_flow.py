@@ -79,10 +79,10 @@ def estimate(data: object, output: object, **options) -> EstimatedFlow:
 
 
 def test_icp_finds_a_translation_and_the_last_frame_looks_back():
-    flow = FlowOfSequence("icp", points=40)((0, moving("s", 0))).scene_flow.reshape(3, 40, 3)
+    flow = FlowOfSequence("icp", points=40)(moving("s", 0)).scene_flow.reshape(3, 40, 3)
     np.testing.assert_allclose(flow[:2], np.broadcast_to(SHIFT, (2, 40, 3)), atol=2e-4)
     np.testing.assert_allclose(flow[2], np.broadcast_to(-SHIFT, (40, 3)), atol=2e-4)
-    shown = FlowOfSequence("icp", points=40, as_points=True)((0, moving("s", 0)))
+    shown = FlowOfSequence("icp", points=40, as_points=True)(moving("s", 0))
     assert shown.scene_flow is None
     wanted = SHIFT / np.linalg.norm(SHIFT)  # the same way in every frame, the last one too
     lengths = np.linalg.norm(shown.points, axis=1, keepdims=True)
@@ -91,7 +91,7 @@ def test_icp_finds_a_translation_and_the_last_frame_looks_back():
 
 def test_nearest_written_out_looks_into_the_whole_other_frame():
     sequence = moving("s", 1)
-    found = FlowOfSequence("nearest", points=7)((4, sequence))
+    found = FlowOfSequence("nearest", points=7)(sequence)
     for t, other in ((0, 1), (1, 2), (2, 1)):
         for point, flow in zip(found.frame(t), found.scene_flow[7 * t : 7 * t + 7]):
             distances = ((sequence.frame(other) - point) ** 2).sum(1)
@@ -111,7 +111,7 @@ def test_points_are_drawn_with_their_fields_and_small_frames_stay_whole():
     sequence.pose, sequence.joint = np.tile(np.eye(4), (3, 1, 1, 1)), no_joints(3, 1)
     drawn = draw_points(sequence, 20, np.random.default_rng(0))
     assert drawn.pose is sequence.pose and drawn.joint is sequence.joint
-    flow = FlowOfSequence("nearest", points=20)((0, sequence)).scene_flow
+    flow = FlowOfSequence("nearest", points=20)(sequence).scene_flow
     assert flow.shape == (25, 3) and not flow.any()  # toward the empty frame, and back to it
 
 
@@ -143,7 +143,7 @@ def test_flow_that_tells_nothing_gives_no_nan():
     one[7] = [0, 0, 0.5]  # less than 1 %: the percentile is 0, the largest counts
     shown = flow_as_points(replace(still, scene_flow=one))
     assert shown[7, 2] == pytest.approx(np.sqrt(2 / 3), rel=1e-6) and np.count_nonzero(shown) == 1
-    alone = FlowOfSequence("icp", as_points=True)((0, moving("s", 0, frames=1)))
+    alone = FlowOfSequence("icp", as_points=True)(moving("s", 0, frames=1))
     assert not alone.points.any() and alone.num_frames == 1
 
 
@@ -163,7 +163,7 @@ def test_what_is_known_of_a_sequence_stays(data, tmp_path):
                 np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
         for i in range(5):
             own = flow.read(i)
-            points, pairs = before.read(i), FlowOfSequence("nearest", 20)((i, before.read(i)))
+            points, pairs = before.read(i), FlowOfSequence("nearest", 20)(before.read(i))
             np.testing.assert_array_equal(own.scene_flow, pairs.scene_flow)
             np.testing.assert_array_equal(own.time, points.time)
             np.testing.assert_array_equal(shown.read(i).points, flow_as_points(own))
@@ -176,8 +176,8 @@ def test_what_is_known_of_a_sequence_stays(data, tmp_path):
 
 def test_flow_as_points_has_no_place_on_a_map():
     sequence = replace(moving("s", 0), shift=np.array([4.5e5, 5.4e6, 120.0]))
-    assert FlowOfSequence("nearest", 20)((0, sequence)).shift is not None
-    assert FlowOfSequence("nearest", 20, as_points=True)((0, sequence)).shift is None
+    assert FlowOfSequence("nearest", 20)(sequence).shift is not None
+    assert FlowOfSequence("nearest", 20, as_points=True)(sequence).shift is None
 
 
 def test_a_stopped_run_is_continued_to_the_same_bytes(data, tmp_path, monkeypatch):
@@ -207,7 +207,7 @@ def test_a_stopped_run_is_continued_to_the_same_bytes(data, tmp_path, monkeypatc
 
 def test_what_a_worker_process_gets_does_the_same(data):
     with CloudsReader(data) as reader:
-        work, item = FlowOfSequence("nearest", 20), (2, reader.read(2))
+        work, item = FlowOfSequence("nearest", 20), reader.read(2)
     there, given = pickle.loads(pickle.dumps((work, item)))
     np.testing.assert_array_equal(there(given).scene_flow, work(item).scene_flow)
 

@@ -84,12 +84,10 @@ class PerFrameMetric(LearnedMetric):
         self._found: dict[str, list[float]] = {}
 
     def start(self, view: str) -> None:
-        """Begins a view."""
         self._view = view
         self._found[view] = []
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
-        """Measures the view's next frame, f32 (3,H,W) in 0..1."""
         self._found[self._view].append(self.measure(predicted, truth))
 
     def end(self) -> None:

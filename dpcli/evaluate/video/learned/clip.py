@@ -44,14 +44,12 @@ class ClipMetric(PerFrameMetric):
         self.name, self._embedded = name, embedded
 
     def measure(self, predicted: np.ndarray, truth: np.ndarray) -> float:
-        """Returns the cosine or the spherical distance of one frame and its truth, f32 (3,H,W) in 0..1."""
         from dpcli.evaluate.networks.clip import cosines, spherical
 
         pair = self._embedded.pair(predicted, truth)
         return float((cosines if self.name == "clip" else spherical)(*pair))
 
     def choices(self) -> dict[str, Any]:
-        """Returns the network and the order of colors it is given."""
         return self._embedded.choices()
 
 
@@ -63,7 +61,6 @@ class ClipTemporal(LearnedMetric):
         self._found: dict[str, list[np.ndarray]] = {}
 
     def start(self, view: str) -> None:
-        """Begins a view, whose first frame has none before it."""
         self._before, self._gap, self._view = None, FrameGap(), view
         self._found[view] = []
 
@@ -77,7 +74,6 @@ class ClipTemporal(LearnedMetric):
         self._before = now
 
     def end(self) -> None:
-        """Ends the view. Raises DataError when no two frames followed each other."""
         if not self._found[self._view]:
             raise DataError(f"view {self._view!r}: no two frames in a row; clip_temporal compares consecutive ones")
 
@@ -109,7 +105,6 @@ class ClipViews(LearnedMetric):
         self._seen: Counter[int] = Counter()  # views by the number of the frame
 
     def start(self, view: str) -> None:
-        """Counts one more view."""
         self._views += 1
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:

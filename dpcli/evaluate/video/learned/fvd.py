@@ -21,24 +21,20 @@ class FrechetMetric(LearnedMetric):
         self._network = FeatureNetwork.load(variant, folder, device)
 
     def start(self, view: str) -> None:
-        """Begins a video."""
         from dpcli.evaluate.video.frechet.clip_features import VideoFeatures
 
         self._video, self._gap = VideoFeatures(self._network, self._hop), FrameGap()
         self._views.append(view)
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
-        """Takes the next frame of both videos, f32 (3,H,W) in 0..1."""
         if self._gap.before(frame):
             self._video.restart()
         self._video.add(predicted, truth)
 
     def end(self) -> None:
-        """Ends the video. Raises DataError when it had too few frames."""
         self._pairs.append(self._video.result())
 
     def score(self) -> LearnedScore:
-        """Returns the distance over all videos. Raises DataError where there were too few clips for a distribution."""
         from dpcli.evaluate.video.frechet.clip_features import video_distance
         from dpcli.evaluate.video.frechet.variants import feature_choices
 

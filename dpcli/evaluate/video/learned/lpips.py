@@ -30,6 +30,5 @@ class LpipsMetric(PerFrameMetric):
         return float(self._network.distance(*pair, range01_mistake=self._networks.lpips_range01)[0])
 
     def choices(self) -> dict[str, Any]:
-        """Returns the network and the range of colors it is given."""
         given = "0..1, as DisCo gives them by mistake" if self._networks.lpips_range01 else "-1..1"
         return {"network": f"{self._networks.lpips}, v0.1", "colors": given}

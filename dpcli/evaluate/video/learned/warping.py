@@ -133,7 +133,6 @@ class WarpingMetric(LearnedMetric):
         self._parts: dict[str, Any] = {}
 
     def start(self, view: str) -> None:
-        """Begins a view."""
         self._warping, self._gap, self._view = WarpingError(), FrameGap(), view
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
@@ -143,11 +142,9 @@ class WarpingMetric(LearnedMetric):
         self._warping.add(predicted, truth)
 
     def end(self) -> None:
-        """Ends the view. Raises DataError when no two frames followed each other."""
         self._parts[self._view] = self._warping.result()
 
     def score(self) -> LearnedScore:
-        """Returns the mean over the pixels of each view, then over views."""
         each = {view: warping_compute(part) for view, part in self._parts.items()}
         value, own = (
             mean_defined(np.array([getattr(one, key) for one in each.values()])) for key in ("squared", "truth_squared")

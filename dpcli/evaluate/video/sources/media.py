@@ -57,7 +57,6 @@ class FolderSource(Source):
         self.has_alpha = any(_has_alpha(file) for files in self.files for file in files)
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        """Yields the frames of a view, in rising order."""
         for frame in frames:
             yield Picture(rgba=_read_image(self.files[view][frame]))
 
@@ -140,7 +139,6 @@ class ArraySource(Source):
         self.has_alpha = array.shape[-1] == 4
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        """Yields the frames of a view, in rising order."""
         for frame in frames:
             values = np.array(self.array[view, frame])
             if values.shape[-1] == 3:
@@ -184,6 +182,5 @@ class VideoSource(Source):
         self.views, self.frames = [_view_of_folder("")], [count]
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        """Yields the frames of a view, in rising order."""
         read = animation_frames if self.animated else video_frames
         yield from (Picture(rgba=rgba) for rgba in read(self.path, frames))

@@ -53,12 +53,10 @@ class ViewsSource(Source):
         self.frames = [self.header.num_frames] * len(self.views)
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        """Yields the frames of a view, as stored."""
         for frame in frames:
             yield Picture(rgba=self.reader.rgba(view, frame))
 
     def close(self) -> None:
-        """Closes the file."""
         self.reader.close()
 
 
@@ -79,7 +77,6 @@ class SceneSource(Source):
         self.scene.require_times(asked, self.path, span)
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        """Yields the frames of a view, rendered."""
         head = self.header
         cameras = (head.world_to_camera[view, None], head.intrinsics[view, None], head.size)
         for frame in frames:

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.runtime.settings.catalog import Catalog
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.fields import Settings, setting
 
 
 @dataclass(frozen=True)
-class ShapeSchedule:
+class ShapeSchedule(Settings):
     """Holds how long a shape network learns, from pictures of which size, and how often it sees each."""
 
     steps: int = setting(20_000, "Steps of the optimizer; 0: the weights of init are only scored again.", least=0)
@@ -26,12 +26,9 @@ class ShapeSchedule:
     reuse: int = setting(6, "Times that a picture is seen.", least=1)
     amp: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True)
-class ShapeData:
+class ShapeData(Settings):
     """Holds what the pictures of a training show."""
 
     made: float = setting(0.5, "Share of made-up creatures and things.", least=0, most=1)
@@ -51,9 +48,6 @@ class ShapeData:
         least=1,
     )
     init: str | None = setting(None, "Weights to start from: a file or a folder of an earlier training.")
-
-    def __post_init__(self) -> None:
-        check(self)
 
 
 class ShapeTraining(NamedTuple):
