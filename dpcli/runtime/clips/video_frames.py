@@ -33,6 +33,7 @@ _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: 
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
+_APART = 1e-4  # s between frames of one stamp, less than the stamps' own steps
 _HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
 _MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
 _UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro"}
@@ -321,14 +322,18 @@ def frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
     the stamps.
 
     Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
-    milliseconds in some containers and missing (0) in others.
+    milliseconds in some containers and missing (0) in others. Browsers give some frames the stamp of the one before, after
+    which they are put by as little as keeps times rising.
     """
     steady = np.arange(len(stamps)) / rate if rate else None
-    since = stamps - stamps[0]
-    rising = len(stamps) > 1 and bool((np.diff(stamps) > 0).all()) and bool(np.isfinite(stamps).all())
-    if not rising or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
+    since, steps = stamps - stamps[0], np.diff(stamps)
+    known = len(stamps) > 1 and bool((steps >= 0).all() and (steps > 0).mean() > 0.5 and np.isfinite(stamps).all())
+    if not known or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
         return steady
-    return since
+    if (steps > 0).all():
+        return since
+    apart = _APART * np.arange(len(stamps))
+    return np.maximum.accumulate(since - apart) + apart
 
 
 def lasts(times: np.ndarray, duration: float) -> bool:

@@ -118,6 +118,10 @@ def test_frame_times_follow_the_stamps_where_a_rate_cannot():
     uneven = np.array([0.5, 0.55, 0.6, 0.9, 1.2, 1.5])
     np.testing.assert_allclose(frame_times(uneven, 4.0), uneven - 0.5)
     np.testing.assert_allclose(frame_times(uneven, None), uneven - 0.5)
+    stamps = np.array([0, 0.033, 0.067, 0.9, 0.9, 0.933, 1.5])  # two frames at 0.9, as browsers record
+    twice = frame_times(stamps, 30.0)
+    np.testing.assert_allclose(twice, stamps, atol=2e-4)
+    assert (np.diff(twice) > 0).all() and frame_times(np.floor(np.arange(12) / 4), None) is None
     assert lasts(uneven - 0.5, 1.3) and not lasts(uneven - 0.5, 3.0) and not lasts(np.zeros(1), 3.0)
 
 
