@@ -6,6 +6,7 @@ import io
 import struct
 import zlib
 
+import av
 import numpy as np
 import PIL
 import pytest
@@ -237,6 +238,17 @@ def test_frames_shown_for_less_than_browsers_can_stay_a_tenth_of_a_second(tmp_pa
     images[0].save(tmp_path / f"a.{suffix}", save_all=True, append_images=images[1:], duration=lasting)
     expected = np.cumsum([0, 100, *lasting[1:-1]]) / 1000
     np.testing.assert_allclose(open_frames(tmp_path / f"a.{suffix}").times, expected, atol=1e-6)
+
+
+def test_an_avif_of_sixty_pictures_a_second_keeps_its_rate(tmp_path):
+    with av.open(str(tmp_path / "a.avif"), "w") as file:
+        stream = file.add_stream("libsvtav1", rate=60, options={"preset": "12"})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for k in range(13):
+            picture = np.full((64, 64, 3), 10 * k, np.uint8)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        file.mux(stream.encode())
+    np.testing.assert_allclose(open_frames(tmp_path / "a.avif").times, np.arange(13) / 60, atol=6e-4)
 
 
 def test_pages_of_a_tiff_are_no_clip(tmp_path):
