@@ -11,7 +11,33 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 
 _LARGEST = 12_000  # pixels of a square's side, above 8K video; more take gigabytes to make smaller
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
+_OUTLINE = 3  # pixels within which an outline is soft
+_FILLED = 0.9  # of a side: corners may be round
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Holds what can be seen of a picture u8 (height,width,4) that is black and see-through around it."""
+
+    rgba: np.ndarray
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, rgba: np.ndarray) -> Piece:
+        """Returns a copy of what can be seen of a picture."""
+        left, top, right, bottom = _box_of(rgba[..., 3] > 0) or (0, 0, 0, 0)
+        return cls(rgba[top:bottom, left:right].copy(), left, top, *rgba.shape[1::-1])
+
+    def whole(self) -> np.ndarray:
+        """Returns the whole picture."""
+        picture = np.zeros((self.height, self.width, 4), np.uint8)
+        height, width = self.rgba.shape[:2]
+        picture[self.top : self.top + height, self.left : self.left + width] = self.rgba
+        return picture
 
 
 @dataclass(frozen=True)
@@ -74,6 +100,10 @@ def visible_box(alpha: np.ndarray, island: float = 0.0) -> Box | None:
         large = stats[:, cv2.CC_STAT_AREA] >= island * seen.sum()
         large[0] = False
         seen = large[label] if large.any() else seen
+    return _box_of(seen)
+
+
+def _box_of(seen: np.ndarray) -> Box | None:
     columns, rows = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
     if len(columns) == 0:
         return None
@@ -93,6 +123,15 @@ def touches_border(alpha: np.ndarray) -> bool:
     solid = alpha > 127
     runs = [solid[0].sum(), solid[-1].sum(), solid[:, 0].sum(), solid[:, -1].sum()]
     return max(runs) >= max(2, min(solid.shape) // 100)
+
+
+def fills_sides(alpha: np.ndarray, box: Box) -> bool:
+    """Returns whether the object in u8 (H,W) fills all four sides of its box, as a picture between bars does."""
+    left, top, right, bottom = box
+    solid = alpha[top:bottom, left:right] > 127
+    at = min(_OUTLINE, min(solid.shape) // 2)
+    sides = (solid[at], solid[-1 - at], solid[:, at], solid[:, -1 - at]) if at else ()
+    return bool(sides) and min(side.mean() for side in sides) > _FILLED
 
 
 def union(boxes: list[Box]) -> Box:

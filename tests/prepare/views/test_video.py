@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from unittest import mock
 
 import av
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
-from dpcli.prepare.views import matting
+from dpcli.prepare.views import matting, video
 from dpcli.prepare.views.given_views import read_cameras
 from dpcli.prepare.views.orbit_world import shares_of_boxes, up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
@@ -426,6 +427,40 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     (gap / "2.png").unlink()
     video_clip(gap, SMALL)
     assert "3.png follows 1.png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("fitting", "cuts"), [(1 << 28, 4), (4 * 18 * 18, 7), (0, 8)])
+def test_frames_are_cut_once_as_far_as_they_fit_into_memory(tmp_path, monkeypatch, fitting, cuts):
+    monkeypatch.setattr(video, "_KEPT", fitting)
+    cut = mock.Mock(side_effect=matting.key_out)
+    monkeypatch.setattr(matting, "key_out", cut)
+    pictures = read(video_clip(save(tmp_path, [on(picture) for picture in moving()]), SMALL))
+    assert cut.call_count == cuts
+    for (_, frame), picture in pictures.items():
+        whole = matting.key_out(on(moving()[frame]), np.full(3, 255.0))[0]
+        np.testing.assert_array_equal(picture, crop_around((12, 16, 43, 32), 0.2).apply(whole, 64))
+
+
+def test_an_alpha_of_0_everywhere_is_none(tmp_path, capsys):
+    pictures = [np.dstack([on(picture), np.zeros((48, 64), np.uint8)]) for picture in moving()]
+    clip = read(video_clip(save(tmp_path / "clear", pictures), SMALL))
+    assert "its alpha is 0 everywhere, which is none" in capsys.readouterr().err
+    plain = read(video_clip(save(tmp_path / "plain", [picture[..., :3] for picture in pictures]), SMALL))
+    assert all((clip[key] == plain[key]).all() for key in plain)
+
+
+@pytest.mark.parametrize(("top", "left"), [(0, 40), (30, 0), (6, 8)])
+def test_bars_around_a_picture_are_told(tmp_path, capsys, top, left):
+    """A clip recorded from a screen: the white picture between black bars was the object, without a word."""
+    inside = np.stack([on(picture) for picture in moving()])
+    framed = np.pad(inside, ((0, 0), (top, top), (left, left), (0, 0)))
+    video_clip(save(tmp_path / "framed", list(framed)), SMALL)
+    assert f"ffmpeg -i IN -vf crop=64:48:{left}:{top} OUT" in (said := capsys.readouterr().err) and "leaves" not in said
+    video_clip(save(tmp_path / "plain", list(inside)), SMALL)
+    square = inside[0, 8:20, :16] // 2
+    moved = [np.pad(square, ((k, 40 - k), (k, 60 - k), (0, 0))) for k in (9, 14)]
+    video_clip(save(tmp_path / "moved", moved), SMALL)
+    assert "rectangle" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["straight", "premultiplied", "black", "outlined", "hard"])
