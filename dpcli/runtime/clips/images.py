@@ -17,6 +17,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.color_tags import color_tags
+from dpcli.runtime.clips.other_files import known_kind
 from dpcli.runtime.progress import log
 
 IMAGE_SUFFIXES = (
@@ -56,11 +57,17 @@ def require_plausible(where: object, width: int, height: int, held: int) -> None
 
 @contextmanager
 def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
-    """Opens an image whose size is plausible. Raises DataError where it isn't, and what Pillow does for one that is damaged."""
-    from PIL import Image
+    """Opens an image whose size is plausible. Raises DataError where it isn't or is known to be something else, and what Pillow
+    does for one that is damaged.
+    """
+    from PIL import Image, UnidentifiedImageError
 
     try:
         opened = Image.open(_with_alpha_of_webp(path) or path)
+    except UnidentifiedImageError:
+        if what := known_kind(path):
+            raise DataError(f"{path}: not a readable image ({what})") from None
+        raise
     except Image.DecompressionBombError as error:
         raise DataError(f"{path}: not a picture of plausible size ({error}); export it smaller") from None
     if opened.format == "TIFF" and opened.tag_v2.get(_PLANES) == _APART:

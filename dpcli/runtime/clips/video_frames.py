@@ -31,6 +31,7 @@ VIDEO_SUFFIXES = (
 )
 _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
+_STILL = (b"ftypheic", b"ftypheix", b"ftypmif1")  # how pictures of phones begin
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
 _APART = 1e-4  # s between frames of one stamp, less than the stamps' own steps
@@ -158,6 +159,9 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
     import av
 
     try:
+        with path.open("rb") as file:
+            if file.read(12)[4:] in _STILL:
+                raise ValueError  # of its tiles, FFmpeg would read the first
         container = open_container(path)
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video ({no_video(path)})") from None

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.prepare.decode.color_frames import image_size, open_frames, read_rgba
 from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
@@ -444,6 +444,11 @@ def test_what_is_no_video_is_told_by_what_it_is(tmp_path, start, said):
     (tmp_path / "clip.mp4").write_bytes(start)
     with pytest.raises(DataError, match=f"clip.mp4: not a readable video .*{re.escape(said)}"):
         look_at_video(tmp_path / "clip.mp4")
+    (tmp_path / "0.jpg").write_bytes(start)  # and so is what is called an image
+    said = re.escape(said if start else "")
+    for reads in (image_size, read_rgba, read_mask):
+        with pytest.raises(DataError, match=f"0.jpg: not a readable (image|mask) .*{said}"):
+            reads(tmp_path / "0.jpg")
 
 
 def test_a_folder_of_videos_lists_them(pictures, tmp_path):
