@@ -36,6 +36,7 @@ from dpcli.prepare.views.square_crop import (
     crop_around,
     fills_sides,
     pieces,
+    still_box,
     touches_border,
     union,
     visible_box,
@@ -231,6 +232,7 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     warn_gaps(frames)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty, apart, dark, whole, framed = [], [], [], [], [], [], 0, 0
+    beside = np.zeros((height, width), np.int32)  # in how many frames a pixel shows something apart from the object
     for index, rgba in zip(wanted, cutter.cut(wanted)):
         box = visible_box(rgba[..., 3], _ISLAND)
         if box is None:
@@ -242,7 +244,9 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         whole += cutter.mode == "mask" and rgba[..., 3].min() > 127
         if cutter.mode != "keep" and touches_border(rgba[..., 3]):
             cut_off.append(index)
-        if pieces(rgba[..., 3], _OBJECT) > 1:
+        count, rest = pieces(rgba[..., 3], _OBJECT)
+        beside += rest
+        if count > 1:
             apart.append(index)
         if cutter.mode == "alpha" and matting.fades_to_black(rgba):
             dark.append(index)
@@ -261,6 +265,12 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     crop = crop_around(union(boxes), options.border) if options.crops else whole_picture(width, height)
     if options.recenter and not options.crops:
         log.info(f"{frames.path}: not cropped, so that its camera stays as the other views' cameras expect it")
+    if cutter.mode != "keep" and len(good) > 1 and (logo := still_box(crop.part_of(beside), len(good))):
+        log.warn(
+            f"{frames.path}: something apart from the object stands still in {logo[2] - logo[0]}x{logo[3] - logo[1]} pixels at"
+            f" ({logo[0] + max(crop.left, 0)}, {logo[1] + max(crop.top, 0)}), as a logo does; it is taken for part of the object:"
+            " paint it over, or give --mask FOLDER"
+        )
     if crop.side < options.size / 1.5:
         log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
     log.info(

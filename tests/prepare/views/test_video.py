@@ -449,6 +449,17 @@ def test_an_alpha_of_0_everywhere_is_none(tmp_path, capsys):
     assert all((clip[key] == plain[key]).all() for key in plain)
 
 
+@pytest.mark.parametrize(("drift", "right", "told"), [(0, 50, True), (1, 50, False), (0, 86, False)])
+def test_what_stands_still_beside_the_object_is_told(tmp_path, capsys, drift, right, told):
+    """A small logo, which is hidden once; a small piece that moves is the object's, and one outside of the crop is none."""
+    pictures = [on(disc((12 + 5 * k, 24), 8, size=(96, 48))) for k in range(7)]
+    for k, picture in enumerate(pictures):
+        picture[40 - drift * k : 43 - drift * k, right : right + 2] = 90 if k < 6 else 255
+    video_clip(save(tmp_path, pictures), SMALL)
+    said = "something apart from the object stands still in 2x3 pixels at (50, 40), as a logo does"
+    assert (said in capsys.readouterr().err) is told
+
+
 @pytest.mark.parametrize(("top", "left"), [(0, 40), (30, 0), (6, 8)])
 def test_bars_around_a_picture_are_told(tmp_path, capsys, top, left):
     """A clip recorded from a screen: the white picture between black bars was the object, without a word."""
