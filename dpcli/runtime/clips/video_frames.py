@@ -31,6 +31,7 @@ VIDEO_SUFFIXES = (
 )
 _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
+_UNTOLD = {"colorspace": 2, "color_primaries": 2, "color_trc": 2, "color_range": 0}  # what H.273 has for "unspecified"
 _STILL = (b"ftypheic", b"ftypheix", b"ftypmif1")  # how pictures of phones begin
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
@@ -191,6 +192,9 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     import av
 
     context = stream.codec_context
+    # The container's colors, before a decoder puts those of the stream in their place, also where it tells none.
+    told = {name: tag for name, none in _UNTOLD.items() if (tag := getattr(context, name)) != none}
+    silent = context.codec.canonical_name == "vp8"  # which has no place for them: FFmpeg assumes some
     wanted = _ALPHA_DECODERS.get(context.codec.canonical_name)
     if wanted and stream.metadata.get("alpha_mode", stream.metadata.get("ALPHA_MODE")) == "1":
         context = av.CodecContext.create(wanted, "r")
@@ -206,6 +210,9 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
             continue
         for frame in frames:
             begun = True
+            if silent or frame.colorspace == _UNTOLD["colorspace"]:
+                for name, tag in told.items():
+                    setattr(frame, name, tag)
             yield frame
 
 

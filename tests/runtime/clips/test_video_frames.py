@@ -210,6 +210,18 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
+@pytest.mark.parametrize("codec, name", [("libvpx", "c.webm"), ("libvpx-vp9", "c.webm"), ("libx265", "c.mp4")])
+def test_colors_that_the_container_alone_tells_count(tmp_path, codec, name):
+    """As a copy of a stream with tags leaves it; FFmpeg's decoders forget them."""
+    Image.new("RGB", (64, 64), (200, 30, 30)).save(tmp_path / "0.png")
+    scaled = "scale=out_color_matrix=bt709:out_range=pc,format=yuv420p"
+    untold = "setparams=range=unknown:color_primaries=unknown:color_trc=unknown:colorspace=unknown"
+    film(tmp_path, tmp_path / name, "-vf", f"{scaled},{untold}", "-c:v", codec, "-crf", 4, "-b:v", "4M")
+    tags = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "pc")
+    ffmpeg("-i", tmp_path / name, "-c", "copy", *tags, tmp_path / f"told_{name}")
+    assert np.abs(decoded(tmp_path / f"told_{name}")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
+
+
 WEIGHTS = {
     1: (0.2126, 0.0722),
     5: (0.299, 0.114),
