@@ -36,6 +36,7 @@ _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
 _PLANES, _APART = 284, 2  # the same: whether the channels lie one after the other
 _OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
+_CAMERA_GAMMA = 0.50994  # of BT.709's camera curve, which older FFmpeg writes into frames of videos; they show as the videos do
 _GRAY_SCALES = {"L;2": 85, "L;4": 17}  # of fewer bits than 8, by Pillow's names for them
 
 
@@ -183,7 +184,8 @@ def as_shown(image, info: dict | None = None):  # image: PIL.Image.Image -> PIL.
     if profile:
         return _of_profile(image, profile)
     gamma = info.get("gamma") or _GAMMA
-    if "srgb" in info or abs(gamma / _GAMMA - 1) < 0.05 or image.mode not in _COLORS:
+    plain = abs(gamma / _GAMMA - 1) < 0.05 or round(gamma, 5) == _CAMERA_GAMMA
+    if "srgb" in info or plain or image.mode not in _COLORS:
         return image
     image = image.convert("RGBA")
     return image.point([*(wide_color.codes_of_gamma(gamma).tolist() * 3), *range(256)])

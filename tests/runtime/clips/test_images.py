@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from pathlib import Path
 
 import av
 import numpy as np
@@ -357,14 +358,27 @@ def test_gray_that_pillow_changes_is_refused(tmp_path, kind, tags, words):
         read_rgba(tmp_path / "a.tif")
 
 
+def tell_gamma(path: Path, gamma: int) -> None:
+    """Puts a gamma, in hundred thousandths, behind the header of a PNG."""
+    data = path.read_bytes()
+    chunk = b"gAMA" + struct.pack(">I", gamma)
+    told = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    path.write_bytes(data[:33] + told + data[33:])
+
+
+def test_frames_that_ffmpeg_took_from_a_video_show_as_the_video(tmp_path):
+    """Before it had cICP, FFmpeg wrote the gamma of the camera's curve beside unchanged levels of BT.709, 601 and 2020."""
+    colors = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
+    Image.fromarray(colors).save(tmp_path / "a.png")
+    tell_gamma(tmp_path / "a.png", round(100_000 / 1.961))
+    np.testing.assert_array_equal(read_rgba(tmp_path / "a.png")[..., :3], colors)
+
+
 def test_the_gamma_of_gray_counts_in_sixteen_bits_as_in_eight(tmp_path):
     gray = np.linspace(0, 255, 48).astype(np.uint8).reshape(6, 8)
     for name, own in (("8", gray), ("16", gray.astype(np.uint16) * 257)):
         Image.fromarray(own).save(tmp_path / f"{name}.png")
-        data = (tmp_path / f"{name}.png").read_bytes()
-        chunk = b"gAMA" + struct.pack(">I", 100_000)
-        told = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        (tmp_path / f"{name}.png").write_bytes(data[:33] + told + data[33:])
+        tell_gamma(tmp_path / f"{name}.png", 100_000)
     eight, sixteen = (read_rgba(tmp_path / f"{name}.png") for name in ("8", "16"))
     np.testing.assert_array_equal(sixteen, eight)
     assert not np.array_equal(eight[..., 0], gray)
