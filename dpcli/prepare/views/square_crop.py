@@ -13,6 +13,7 @@ _LARGEST = 12_000  # pixels of a square's side, above 8K video; more take gigaby
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
 _OUTLINE = 3  # pixels within which an outline is soft
 _MOST = 0.8  # of the frames, and of the pixels of something that stands still in them
+_SPECK = 1e-4  # of a picture: smaller things are noise
 _FILLED = 0.9  # of a side: corners may be round
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
 
@@ -133,6 +134,7 @@ def still_box(seen: np.ndarray, frames: int) -> Box | None:
     _, label = cv2.connectedComponents((seen > 0).astype(np.uint8), connectivity=8)
     ever = np.bincount(label.ravel())
     still = np.bincount(label.ravel(), weights=(seen >= _MOST * frames).ravel()) >= _MOST * ever
+    still &= ever >= max(4, _SPECK * label.size)
     still[0] = False
     return _box_of(still[label])
 

@@ -358,19 +358,31 @@ def test_gray_that_pillow_changes_is_refused(tmp_path, kind, tags, words):
         read_rgba(tmp_path / "a.tif")
 
 
-def tell_gamma(path: Path, gamma: int) -> None:
-    """Puts a gamma, in hundred thousandths, behind the header of a PNG."""
+def tell(path: Path, kind: bytes, *numbers: int) -> None:
+    """Puts numbers, in hundred thousandths, behind the header of a PNG."""
     data = path.read_bytes()
-    chunk = b"gAMA" + struct.pack(">I", gamma)
-    told = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    chunk = kind + struct.pack(f">{len(numbers)}I", *numbers)
+    told = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
     path.write_bytes(data[:33] + told + data[33:])
+
+
+def test_primaries_of_an_hdr_clip_without_its_curve_are_told(tmp_path, capsys):
+    for name, xy in (
+        ("wide", (70800, 29200, 17000, 79700, 13100, 4600)),
+        ("plain", (64000, 33000, 30000, 60000, 15000, 6000)),
+    ):
+        (tmp_path / name).mkdir()
+        Image.new("RGB", (8, 8), (200, 30, 30)).save(tmp_path / name / "0.png")
+        tell(tmp_path / name / "0.png", b"cHRM", 31270, 32900, *xy)
+        read_rgba(tmp_path / name / "0.png")
+        assert ("primaries of BT.2020 alone (cHRM)" in capsys.readouterr().err) is (name == "wide")
 
 
 def test_frames_that_ffmpeg_took_from_a_video_show_as_the_video(tmp_path):
     """Before it had cICP, FFmpeg wrote the gamma of the camera's curve beside unchanged levels of BT.709, 601 and 2020."""
     colors = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
     Image.fromarray(colors).save(tmp_path / "a.png")
-    tell_gamma(tmp_path / "a.png", round(100_000 / 1.961))
+    tell(tmp_path / "a.png", b"gAMA", round(100_000 / 1.961))
     np.testing.assert_array_equal(read_rgba(tmp_path / "a.png")[..., :3], colors)
 
 
@@ -378,7 +390,7 @@ def test_the_gamma_of_gray_counts_in_sixteen_bits_as_in_eight(tmp_path):
     gray = np.linspace(0, 255, 48).astype(np.uint8).reshape(6, 8)
     for name, own in (("8", gray), ("16", gray.astype(np.uint16) * 257)):
         Image.fromarray(own).save(tmp_path / f"{name}.png")
-        tell_gamma(tmp_path / f"{name}.png", 100_000)
+        tell(tmp_path / f"{name}.png", b"gAMA", 100_000)
     eight, sixteen = (read_rgba(tmp_path / f"{name}.png") for name in ("8", "16"))
     np.testing.assert_array_equal(sixteen, eight)
     assert not np.array_equal(eight[..., 0], gray)
