@@ -11,7 +11,35 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 
 _LARGEST = 12_000  # pixels of a square's side, above 8K video; more take gigabytes to make smaller
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
+_OUTLINE = 3  # pixels within which an outline is soft
+_MOST = 0.8  # of the frames, and of the pixels of something that stands still in them
+_SPECK = 1e-4  # of a picture: smaller things are noise
+_FILLED = 0.9  # of a side: corners may be round
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Holds what can be seen of a picture u8 (height,width,4) that is black and see-through around it."""
+
+    rgba: np.ndarray
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, rgba: np.ndarray) -> Piece:
+        """Returns a copy of what can be seen of a picture."""
+        left, top, right, bottom = _box_of(rgba[..., 3] > 0) or (0, 0, 0, 0)
+        return cls(rgba[top:bottom, left:right].copy(), left, top, *rgba.shape[1::-1])
+
+    def whole(self) -> np.ndarray:
+        """Returns the whole picture."""
+        picture = np.zeros((self.height, self.width, 4), np.uint8)
+        height, width = self.rgba.shape[:2]
+        picture[self.top : self.top + height, self.left : self.left + width] = self.rgba
+        return picture
 
 
 @dataclass(frozen=True)
@@ -31,13 +59,16 @@ class Crop:
             raise DataError(
                 f"a square of {self.side:,} pixels would be cut out; expected at most {_LARGEST:,}: make the pictures smaller first"
             )
-        height, width = rgba.shape[:2]
         square = np.zeros((self.side, self.side, 4), np.uint8)
-        x0, y0 = max(self.left, 0), max(self.top, 0)
-        x1, y1 = min(self.left + self.side, width), min(self.top + self.side, height)
-        if x1 > x0 and y1 > y0:
-            square[y0 - self.top : y1 - self.top, x0 - self.left : x1 - self.left] = rgba[y0:y1, x0:x1]
+        part = self.part_of(rgba)
+        left, top = max(-self.left, 0), max(-self.top, 0)
+        square[top : top + part.shape[0], left : left + part.shape[1]] = part
         return resize(square, size)
+
+    def part_of(self, picture: np.ndarray) -> np.ndarray:
+        """Returns what of a picture (H,W,...) lies in the square."""
+        rows, columns = (slice(max(start, 0), max(start + self.side, 0)) for start in (self.top, self.left))
+        return picture[rows, columns]
 
     def intrinsics(self, camera: np.ndarray, size: int) -> np.ndarray:
         """Returns f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centers at +0.5."""
@@ -74,18 +105,38 @@ def visible_box(alpha: np.ndarray, island: float = 0.0) -> Box | None:
         large = stats[:, cv2.CC_STAT_AREA] >= island * seen.sum()
         large[0] = False
         seen = large[label] if large.any() else seen
+    return _box_of(seen)
+
+
+def _box_of(seen: np.ndarray) -> Box | None:
     columns, rows = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
     if len(columns) == 0:
         return None
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def pieces(alpha: np.ndarray, share: float) -> int:
-    """Returns how many pieces of the object in u8 (H,W) lie apart, none smaller than this share of the largest."""
+def pieces(alpha: np.ndarray, share: float) -> tuple[int, np.ndarray]:
+    """Returns how many pieces of the object in u8 (H,W) lie apart, none smaller than this share of the largest, and bool (H,W):
+    all of it but the largest.
+    """
     cv2 = load_cv2()
-    _, _, stats, _ = cv2.connectedComponentsWithStats((alpha >= VISIBLE).astype(np.uint8), connectivity=8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats((alpha >= VISIBLE).astype(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]  # row 0 is the background
-    return int((areas >= share * areas.max(initial=1)).sum())
+    rest = (label > 0) & (label != 1 + (areas.argmax() if len(areas) else 0))
+    return int((areas >= share * areas.max(initial=1)).sum()), rest
+
+
+def still_box(seen: np.ndarray, frames: int) -> Box | None:
+    """Returns the smallest box around what keeps its shape and place in nearly all frames, of the numbers of them in which a
+    pixel (H,W) was seen; None where nothing does.
+    """
+    cv2 = load_cv2()
+    _, label = cv2.connectedComponents((seen > 0).astype(np.uint8), connectivity=8)
+    ever = np.bincount(label.ravel())
+    still = np.bincount(label.ravel(), weights=(seen >= _MOST * frames).ravel()) >= _MOST * ever
+    still &= ever >= max(4, _SPECK * label.size)
+    still[0] = False
+    return _box_of(still[label])
 
 
 def touches_border(alpha: np.ndarray) -> bool:
@@ -93,6 +144,15 @@ def touches_border(alpha: np.ndarray) -> bool:
     solid = alpha > 127
     runs = [solid[0].sum(), solid[-1].sum(), solid[:, 0].sum(), solid[:, -1].sum()]
     return max(runs) >= max(2, min(solid.shape) // 100)
+
+
+def fills_sides(alpha: np.ndarray, box: Box) -> bool:
+    """Returns whether the object in u8 (H,W) fills all four sides of its box, as a picture between bars does."""
+    left, top, right, bottom = box
+    solid = alpha[top:bottom, left:right] > 127
+    at = min(_OUTLINE, min(solid.shape) // 2)
+    sides = (solid[at], solid[-1 - at], solid[:, at], solid[:, -1 - at]) if at else ()
+    return bool(sides) and min(side.mean() for side in sides) > _FILLED
 
 
 def union(boxes: list[Box]) -> Box:

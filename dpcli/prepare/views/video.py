@@ -29,7 +29,19 @@ from dpcli.prepare.views import matting
 from dpcli.prepare.views.cameras_beside import tell_cameras_beside
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
 from dpcli.prepare.views.masks import mask_of_video, read_mask
-from dpcli.prepare.views.square_crop import Crop, crop_around, pieces, touches_border, union, visible_box, whole_picture
+from dpcli.prepare.views.square_crop import (
+    Box,
+    Crop,
+    Piece,
+    crop_around,
+    fills_sides,
+    pieces,
+    still_box,
+    touches_border,
+    union,
+    visible_box,
+    whole_picture,
+)
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
@@ -37,6 +49,8 @@ from dpcli.store.views import ViewsHeader
 _LISTED = 8
 _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
 _OBJECT = 0.2  # of the largest piece: one that large, apart from it, is another object
+_KEPT = 1 << 28  # bytes of cut frames that stay in memory
+_STILL = 2  # pixels that the sides of something still move by
 _ANNOTATIONS = (".json", ".txt", ".xml", ".npy", ".npz")  # of LabelMe, YOLO, CVAT, SAM
 
 
@@ -177,9 +191,23 @@ class Cutter:
     background: np.ndarray | None = None
     masks: tuple[Path, ...] | Frames = ()
     gaps: dict[int, int] = field(default_factory=dict)  # pixels taken for holes, by frame
+    kept: dict[int, Piece] = field(default_factory=dict)  # frames that were cut already, as far as they fit
 
     def cut(self, wanted: list[int]) -> Iterator[np.ndarray]:
-        """Yields u8 (H,W,4), straight alpha, of the frames `wanted`, rising."""
+        """Yields u8 (H,W,4), straight alpha, of the frames `wanted`, rising. What fits into memory is cut but once."""
+        anew = self._cut_anew([index for index in wanted if index not in self.kept])
+        size = sum(piece.rgba.nbytes for piece in self.kept.values())
+        for index in wanted:
+            if index in self.kept:
+                yield self.kept[index].whole()
+                continue
+            piece = Piece.of(rgba := next(anew))
+            size += piece.rgba.nbytes
+            if size <= _KEPT:
+                self.kept[index] = piece
+            yield rgba
+
+    def _cut_anew(self, wanted: list[int]) -> Iterator[np.ndarray]:
         masks = self._read_masks(wanted)
         for index, frame in zip(wanted, self.frames.read(wanted)):
             if self.mode == "mask":
@@ -207,7 +235,8 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
-    boxes, cut_off, good, empty, apart, dark, whole = [], [], [], [], [], [], 0
+    boxes, cut_off, good, empty, apart, dark, whole, framed = [], [], [], [], [], [], 0, 0
+    beside = np.zeros((height, width), np.int32)  # in how many frames a pixel shows something apart from the object
     for index, rgba in zip(wanted, cutter.cut(wanted)):
         box = visible_box(rgba[..., 3], _ISLAND)
         if box is None:
@@ -215,10 +244,13 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
             continue
         boxes.append(box)
         good.append(index)
+        framed += fills_sides(rgba[..., 3], box)
         whole += cutter.mode == "mask" and rgba[..., 3].min() > 127
         if cutter.mode != "keep" and touches_border(rgba[..., 3]):
             cut_off.append(index)
-        if pieces(rgba[..., 3], _OBJECT) > 1:
+        count, rest = pieces(rgba[..., 3], _OBJECT)
+        beside += rest
+        if count > 1:
             apart.append(index)
         if cutter.mode == "alpha" and matting.fades_to_black(rgba):
             dark.append(index)
@@ -229,12 +261,20 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
             "label 0 (the whole picture: --background keep)"
         )
     half = len(good) / 2
+    if cutter.mode != "keep" and 1 < framed == len(good) and _tell_bars(frames, boxes):
+        cut_off = []
     _tell_doubts(cutter, cut_off, apart if len(apart) > half else [], dark if len(dark) > half else [])
     if len(good) == 1:
         log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
     crop = crop_around(union(boxes), options.border) if options.crops else whole_picture(width, height)
     if options.recenter and not options.crops:
         log.info(f"{frames.path}: not cropped, so that its camera stays as the other views' cameras expect it")
+    if cutter.mode != "keep" and len(good) > 1 and (logo := still_box(crop.part_of(beside), len(good))):
+        log.warn(
+            f"{frames.path}: something apart from the object stands still in {logo[2] - logo[0]}x{logo[3] - logo[1]} pixels at"
+            f" ({logo[0] + max(crop.left, 0)}, {logo[1] + max(crop.top, 0)}), as a logo does; it is taken for part of the object:"
+            " paint it over, or give --mask FOLDER"
+        )
     if crop.side < options.size / 1.5:
         log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
     log.info(
@@ -264,6 +304,18 @@ def _tell_doubts(cutter: Cutter, cut_off: list[int], apart: list[int], dark: lis
         log.info(
             f"{frames.path}: gaps in the object are see-through in {counted(count, 'frame')} (--holes keep fills them)"
         )
+
+
+def _tell_bars(frames: Frames, boxes: list[Box]) -> bool:
+    """Warns of rectangles (boxes of the object, all filled) that are the same in all frames, and returns whether they are."""
+    if np.ptp(boxes, axis=0).max() > _STILL:
+        return False
+    left, top, right, bottom = union(boxes)
+    log.warn(
+        f"{frames.path}: what is cut out is the same rectangle in all frames, as a picture between bars is; where the object lies"
+        f" within it, cut the bars off first: ffmpeg -i IN -vf crop={right - left}:{bottom - top}:{left}:{top} OUT"
+    )
+    return True
 
 
 def _how(cutter: Cutter) -> str:
@@ -324,20 +376,23 @@ def warn_gaps(frames: Frames) -> None:
 
 def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tuple[Cutter, tuple[int, int]]:
     """Looks at every frame once: one size, alpha or none, what is around the object."""
-    shape, borders, clear = None, [], []
+    shape, borders, clear, seen = None, [], [], False
     if frames.path.is_dir():  # by their headers first: a damaged one may tell of 16 million pixels
         _require_one_size(frames, wanted, [image_size(frames.files[index]) for index in wanted])
     for index, frame in zip(wanted, frames.read(wanted)):
         shape = shape or frame.shape
         _require_one_size(frames, [wanted[0], index], [shape[1::-1], frame.shape[1::-1]])
         clear.append(bool((frame[..., 3] < 255).any()))
+        seen = seen or bool(frame[..., 3].any())
         borders.append(matting.border_pixels(frame[..., :3]))
     size = (shape[1], shape[0])
     if options.mask:
         return Cutter(frames, options, "mask", masks=find_masks(frames, options.mask)), size
     if options.background == "keep":
         return Cutter(frames, options, "keep"), size
-    if any(clear):
+    if not seen:  # programs that write four bytes a pixel may leave the fourth empty
+        log.info(f"{frames.path}: its alpha is 0 everywhere, which is none; read as opaque")
+    elif any(clear):
         if not all(clear):
             without = [index for index, has in zip(wanted, clear) if not has]
             raise DataError(f"{frames.path}: {_named(frames, without)} without alpha, though other frames have it")

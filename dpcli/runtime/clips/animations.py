@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -62,10 +63,15 @@ def _durations(path: Path, image) -> Iterator[float]:  # image: PIL.Image.Image
         seconds = apng_seconds(path)
         yield from (1000 * one for one, _ in zip(seconds, apng_canvases(path, *image.size), strict=True))
         return
+    lasting, stamps = [], []
     for index in range(getattr(image, "n_frames", 1)):
         image.seek(index)
         image.load()
-        yield float(image.info.get("duration", 0) or 0)
+        lasting.append(float(image.info.get("duration", 0) or 0))
+        stamps.append(image.info.get("timestamp", 0))
+    if image.format == "AVIF":  # Pillow rounds each to milliseconds; of durations the errors would add up
+        lasting[:-1] = (float(after - before) for before, after in pairwise(stamps))
+    yield from lasting
 
 
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:

@@ -17,6 +17,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.color_tags import color_tags
+from dpcli.runtime.clips.other_files import known_kind
 from dpcli.runtime.progress import log
 
 IMAGE_SUFFIXES = (
@@ -35,6 +36,10 @@ _PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
 _PLANES, _APART = 284, 2  # the same: whether the channels lie one after the other
 _OF_SEVERAL = ("GIF", "PNG", "WEBP", "AVIF", "TIFF")
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
+_CAMERA_GAMMA = (
+    0.50994  # of BT.709's camera curve: older FFmpeg writes it beside the unchanged levels of a video's frames
+)
+_BT2020_XY = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046)  # of red, green and blue
 _GRAY_SCALES = {"L;2": 85, "L;4": 17}  # of fewer bits than 8, by Pillow's names for them
 
 
@@ -56,11 +61,17 @@ def require_plausible(where: object, width: int, height: int, held: int) -> None
 
 @contextmanager
 def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
-    """Opens an image whose size is plausible. Raises DataError where it isn't, and what Pillow does for one that is damaged."""
-    from PIL import Image
+    """Opens an image whose size is plausible. Raises DataError where it isn't or is known to be something else, and what Pillow
+    does for one that is damaged.
+    """
+    from PIL import Image, UnidentifiedImageError
 
     try:
         opened = Image.open(_with_alpha_of_webp(path) or path)
+    except UnidentifiedImageError:
+        if what := known_kind(path):
+            raise DataError(f"{path}: not a readable image ({what})") from None
+        raise
     except Image.DecompressionBombError as error:
         raise DataError(f"{path}: not a picture of plausible size ({error}); export it smaller") from None
     if opened.format == "TIFF" and opened.tag_v2.get(_PLANES) == _APART:
@@ -70,6 +81,8 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
         require_plausible(path, *image.size, path.stat().st_size)
         if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
             image.info[_TAGS] = tags
+        elif not tags and "icc_profile" not in image.info:
+            _tell_primaries(path, image.info.get("chromaticity", ()))
         _tell_unread_channel(path, image)
         _scale_clear_level(image)
         yield image
@@ -120,6 +133,16 @@ def as_rgba(image):  # image: PIL.Image.Image -> PIL.Image.Image
     gray, clear = np.asarray(image).astype(np.int64), image.info.get("transparency")
     level = np.rint(gray / 257).astype(np.uint8)
     return Image.fromarray(np.dstack([level, level, level, np.where(gray == clear, 0, 255).astype(np.uint8)]))
+
+
+def _tell_primaries(path: Path, xy: Sequence[float]) -> None:
+    """Warns of a PNG whose chromaticities (white, red, green, blue) are those of BT.2020, where nothing tells its curve."""
+    if len(xy) == 8 and np.abs(np.array(xy[2:]) - _BT2020_XY).max() < 0.002:
+        with log.each_once(_SAID):
+            log.warn(
+                f"{path.parent}: PNGs with primaries of BT.2020 alone (cHRM), as older FFmpeg takes from HDR clips; their colors are"
+                " read as sRGB, which makes them pale: give the clip itself, or take frames by FFmpeg 9, which tells all (cICP)"
+            )
 
 
 def _tell_unread_channel(path: Path, image) -> None:  # image: PIL.Image.Image
@@ -176,7 +199,8 @@ def as_shown(image, info: dict | None = None):  # image: PIL.Image.Image -> PIL.
     if profile:
         return _of_profile(image, profile)
     gamma = info.get("gamma") or _GAMMA
-    if "srgb" in info or abs(gamma / _GAMMA - 1) < 0.05 or image.mode not in _COLORS:
+    plain = abs(gamma / _GAMMA - 1) < 0.05 or round(gamma, 5) == _CAMERA_GAMMA
+    if "srgb" in info or plain or image.mode not in _COLORS:
         return image
     image = image.convert("RGBA")
     return image.point([*(wide_color.codes_of_gamma(gamma).tolist() * 3), *range(256)])

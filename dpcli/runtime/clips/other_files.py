@@ -101,9 +101,15 @@ def stand_ins_named(path: Path) -> Iterator[None]:
 def no_video(path: Path) -> str:
     """Returns what a file is that no decoder takes for a video, and what to do about it."""
     try:
-        with open(path, "rb") as file:
-            start = file.read(_START)
+        return known_kind(path) or ("empty, damaged, or of an unknown kind" if path.stat().st_size else "empty")
     except OSError as error:
         return str(error.strerror)
-    unknown = "empty, damaged, or of an unknown kind" if start else "empty"
-    return what_it_is(start, _FOR_CLIPS) or unknown
+
+
+def known_kind(path: Path) -> str:
+    """Returns what a file in the place of a clip or a picture of one is, and what to do about it; "" where it doesn't tell.
+
+    Raises OSError for one that can't be opened.
+    """
+    with open(path, "rb") as file:
+        return what_it_is(file.read(_START), _FOR_CLIPS)

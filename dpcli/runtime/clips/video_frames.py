@@ -31,8 +31,11 @@ VIDEO_SUFFIXES = (
 )
 _BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
 _ASSUMED_RATE = 25.0  # of such a stream, where it tells none
+_UNTOLD = {"colorspace": 2, "color_primaries": 2, "color_trc": 2, "color_range": 0}  # what H.273 has for "unspecified"
+_STILL = (b"ftypheic", b"ftypheix", b"ftypmif1")  # how pictures of phones begin
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
+_APART = 1e-4  # s between frames of one stamp, less than the stamps' own steps
 _HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
 _MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
 _UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro"}
@@ -157,6 +160,9 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
     import av
 
     try:
+        with path.open("rb") as file:
+            if file.read(12)[4:] in _STILL:
+                raise ValueError  # of its tiles, FFmpeg would read the first
         container = open_container(path)
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video ({no_video(path)})") from None
@@ -186,6 +192,9 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     import av
 
     context = stream.codec_context
+    # The container's colors, before a decoder puts those of the stream in their place, also where it tells none.
+    told = {name: tag for name, none in _UNTOLD.items() if (tag := getattr(context, name)) != none}
+    silent = context.codec.canonical_name == "vp8"  # which has no place for them: FFmpeg assumes some
     wanted = _ALPHA_DECODERS.get(context.codec.canonical_name)
     if wanted and stream.metadata.get("alpha_mode", stream.metadata.get("ALPHA_MODE")) == "1":
         context = av.CodecContext.create(wanted, "r")
@@ -201,6 +210,9 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
             continue
         for frame in frames:
             begun = True
+            if silent or frame.colorspace == _UNTOLD["colorspace"]:
+                for name, tag in told.items():
+                    setattr(frame, name, tag)
             yield frame
 
 
@@ -321,14 +333,18 @@ def frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
     the stamps.
 
     Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
-    milliseconds in some containers and missing (0) in others.
+    milliseconds in some containers and missing (0) in others. Browsers give some frames the stamp of the one before, after
+    which they are put by as little as keeps times rising.
     """
     steady = np.arange(len(stamps)) / rate if rate else None
-    since = stamps - stamps[0]
-    rising = len(stamps) > 1 and bool((np.diff(stamps) > 0).all()) and bool(np.isfinite(stamps).all())
-    if not rising or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
+    since, steps = stamps - stamps[0], np.diff(stamps)
+    known = len(stamps) > 1 and bool((steps >= 0).all() and (steps > 0).mean() > 0.5 and np.isfinite(stamps).all())
+    if not known or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
         return steady
-    return since
+    if (steps > 0).all():
+        return since
+    apart = _APART * np.arange(len(stamps))
+    return np.maximum.accumulate(since - apart) + apart
 
 
 def lasts(times: np.ndarray, duration: float) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from unittest import mock
 
 import av
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
-from dpcli.prepare.views import matting
+from dpcli.prepare.views import matting, video
 from dpcli.prepare.views.given_views import read_cameras
 from dpcli.prepare.views.orbit_world import shares_of_boxes, up_of_cameras
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
@@ -118,6 +119,10 @@ def test_frame_times_follow_the_stamps_where_a_rate_cannot():
     uneven = np.array([0.5, 0.55, 0.6, 0.9, 1.2, 1.5])
     np.testing.assert_allclose(frame_times(uneven, 4.0), uneven - 0.5)
     np.testing.assert_allclose(frame_times(uneven, None), uneven - 0.5)
+    stamps = np.array([0, 0.033, 0.067, 0.9, 0.9, 0.933, 1.5])  # two frames at 0.9, as browsers record
+    twice = frame_times(stamps, 30.0)
+    np.testing.assert_allclose(twice, stamps, atol=2e-4)
+    assert (np.diff(twice) > 0).all() and frame_times(np.floor(np.arange(12) / 4), None) is None
     assert lasts(uneven - 0.5, 1.3) and not lasts(uneven - 0.5, 3.0) and not lasts(np.zeros(1), 3.0)
 
 
@@ -422,6 +427,51 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     (gap / "2.png").unlink()
     video_clip(gap, SMALL)
     assert "3.png follows 1.png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("fitting", "cuts"), [(1 << 28, 4), (4 * 18 * 18, 7), (0, 8)])
+def test_frames_are_cut_once_as_far_as_they_fit_into_memory(tmp_path, monkeypatch, fitting, cuts):
+    monkeypatch.setattr(video, "_KEPT", fitting)
+    cut = mock.Mock(side_effect=matting.key_out)
+    monkeypatch.setattr(matting, "key_out", cut)
+    pictures = read(video_clip(save(tmp_path, [on(picture) for picture in moving()]), SMALL))
+    assert cut.call_count == cuts
+    for (_, frame), picture in pictures.items():
+        whole = matting.key_out(on(moving()[frame]), np.full(3, 255.0))[0]
+        np.testing.assert_array_equal(picture, crop_around((12, 16, 43, 32), 0.2).apply(whole, 64))
+
+
+def test_an_alpha_of_0_everywhere_is_none(tmp_path, capsys):
+    pictures = [np.dstack([on(picture), np.zeros((48, 64), np.uint8)]) for picture in moving()]
+    clip = read(video_clip(save(tmp_path / "clear", pictures), SMALL))
+    assert "its alpha is 0 everywhere, which is none" in capsys.readouterr().err
+    plain = read(video_clip(save(tmp_path / "plain", [picture[..., :3] for picture in pictures]), SMALL))
+    assert all((clip[key] == plain[key]).all() for key in plain)
+
+
+@pytest.mark.parametrize(("drift", "right", "told"), [(0, 50, True), (1, 50, False), (0, 86, False)])
+def test_what_stands_still_beside_the_object_is_told(tmp_path, capsys, drift, right, told):
+    """A small logo, which is hidden once; a small piece that moves is the object's, and one outside of the crop is none."""
+    pictures = [on(disc((12 + 5 * k, 24), 8, size=(96, 48))) for k in range(7)]
+    for k, picture in enumerate(pictures):
+        picture[40 - drift * k : 43 - drift * k, right : right + 2] = 90 if k < 6 else 255
+    video_clip(save(tmp_path, pictures), SMALL)
+    said = "something apart from the object stands still in 2x3 pixels at (50, 40), as a logo does"
+    assert (said in capsys.readouterr().err) is told
+
+
+@pytest.mark.parametrize(("top", "left"), [(0, 40), (30, 0), (6, 8)])
+def test_bars_around_a_picture_are_told(tmp_path, capsys, top, left):
+    """A clip recorded from a screen: the white picture between black bars was the object, without a word."""
+    inside = np.stack([on(picture) for picture in moving()])
+    framed = np.pad(inside, ((0, 0), (top, top), (left, left), (0, 0)))
+    video_clip(save(tmp_path / "framed", list(framed)), SMALL)
+    assert f"ffmpeg -i IN -vf crop=64:48:{left}:{top} OUT" in (said := capsys.readouterr().err) and "leaves" not in said
+    video_clip(save(tmp_path / "plain", list(inside)), SMALL)
+    square = inside[0, 8:20, :16] // 2
+    moved = [np.pad(square, ((k, 40 - k), (k, 60 - k), (0, 0))) for k in (9, 14)]
+    video_clip(save(tmp_path / "moved", moved), SMALL)
+    assert "rectangle" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["straight", "premultiplied", "black", "outlined", "hard"])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from pathlib import Path
 
+import av
 import numpy as np
 import PIL
 import pytest
@@ -239,6 +241,17 @@ def test_frames_shown_for_less_than_browsers_can_stay_a_tenth_of_a_second(tmp_pa
     np.testing.assert_allclose(open_frames(tmp_path / f"a.{suffix}").times, expected, atol=1e-6)
 
 
+def test_an_avif_of_sixty_pictures_a_second_keeps_its_rate(tmp_path):
+    with av.open(str(tmp_path / "a.avif"), "w") as file:
+        stream = file.add_stream("libsvtav1", rate=60, options={"preset": "12"})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for k in range(13):
+            picture = np.full((64, 64, 3), 10 * k, np.uint8)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        file.mux(stream.encode())
+    np.testing.assert_allclose(open_frames(tmp_path / "a.avif").times, np.arange(13) / 60, atol=6e-4)
+
+
 def test_pages_of_a_tiff_are_no_clip(tmp_path):
     images = [Image.new("RGB", (8, 8), (k, 0, 0)) for k in range(3)]
     images[0].save(tmp_path / "a.tif", save_all=True, append_images=images[1:])
@@ -345,14 +358,39 @@ def test_gray_that_pillow_changes_is_refused(tmp_path, kind, tags, words):
         read_rgba(tmp_path / "a.tif")
 
 
+def tell(path: Path, kind: bytes, *numbers: int) -> None:
+    """Puts numbers, in hundred thousandths, behind the header of a PNG."""
+    data = path.read_bytes()
+    chunk = kind + struct.pack(f">{len(numbers)}I", *numbers)
+    told = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    path.write_bytes(data[:33] + told + data[33:])
+
+
+def test_primaries_of_an_hdr_clip_without_its_curve_are_told(tmp_path, capsys):
+    for name, xy in (
+        ("wide", (70800, 29200, 17000, 79700, 13100, 4600)),
+        ("plain", (64000, 33000, 30000, 60000, 15000, 6000)),
+    ):
+        (tmp_path / name).mkdir()
+        Image.new("RGB", (8, 8), (200, 30, 30)).save(tmp_path / name / "0.png")
+        tell(tmp_path / name / "0.png", b"cHRM", 31270, 32900, *xy)
+        read_rgba(tmp_path / name / "0.png")
+        assert ("primaries of BT.2020 alone (cHRM)" in capsys.readouterr().err) is (name == "wide")
+
+
+def test_frames_that_ffmpeg_took_from_a_video_show_as_the_video(tmp_path):
+    """Before it had cICP, FFmpeg wrote the gamma of the camera's curve beside unchanged levels of BT.709, 601 and 2020."""
+    colors = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
+    Image.fromarray(colors).save(tmp_path / "a.png")
+    tell(tmp_path / "a.png", b"gAMA", round(100_000 / 1.961))
+    np.testing.assert_array_equal(read_rgba(tmp_path / "a.png")[..., :3], colors)
+
+
 def test_the_gamma_of_gray_counts_in_sixteen_bits_as_in_eight(tmp_path):
     gray = np.linspace(0, 255, 48).astype(np.uint8).reshape(6, 8)
     for name, own in (("8", gray), ("16", gray.astype(np.uint16) * 257)):
         Image.fromarray(own).save(tmp_path / f"{name}.png")
-        data = (tmp_path / f"{name}.png").read_bytes()
-        chunk = b"gAMA" + struct.pack(">I", 100_000)
-        told = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        (tmp_path / f"{name}.png").write_bytes(data[:33] + told + data[33:])
+        tell(tmp_path / f"{name}.png", b"gAMA", 100_000)
     eight, sixteen = (read_rgba(tmp_path / f"{name}.png") for name in ("8", "16"))
     np.testing.assert_array_equal(sixteen, eight)
     assert not np.array_equal(eight[..., 0], gray)

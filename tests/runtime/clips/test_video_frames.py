@@ -14,7 +14,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.prepare.decode.color_frames import image_size, open_frames, read_rgba
 from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
@@ -208,6 +208,18 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     tags = ("-colorspace", matrix, "-color_range", kind)
     film(tmp_path, tmp_path / "c.mp4", *PLAIN, "-vf", scale, *tags)
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
+
+
+@pytest.mark.parametrize("codec, name", [("libvpx", "c.webm"), ("libvpx-vp9", "c.webm"), ("libx265", "c.mp4")])
+def test_colors_that_the_container_alone_tells_count(tmp_path, codec, name):
+    """As a copy of a stream with tags leaves it; FFmpeg's decoders forget them."""
+    Image.new("RGB", (64, 64), (200, 30, 30)).save(tmp_path / "0.png")
+    scaled = "scale=out_color_matrix=bt709:out_range=pc,format=yuv420p"
+    untold = "setparams=range=unknown:color_primaries=unknown:color_trc=unknown:colorspace=unknown"
+    film(tmp_path, tmp_path / name, "-vf", f"{scaled},{untold}", "-c:v", codec, "-crf", 4, "-b:v", "4M")
+    tags = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "pc")
+    ffmpeg("-i", tmp_path / name, "-c", "copy", *tags, tmp_path / f"told_{name}")
+    assert np.abs(decoded(tmp_path / f"told_{name}")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
 WEIGHTS = {
@@ -444,6 +456,11 @@ def test_what_is_no_video_is_told_by_what_it_is(tmp_path, start, said):
     (tmp_path / "clip.mp4").write_bytes(start)
     with pytest.raises(DataError, match=f"clip.mp4: not a readable video .*{re.escape(said)}"):
         look_at_video(tmp_path / "clip.mp4")
+    (tmp_path / "0.jpg").write_bytes(start)  # and so is what is called an image
+    said = re.escape(said if start else "")
+    for reads in (image_size, read_rgba, read_mask):
+        with pytest.raises(DataError, match=f"0.jpg: not a readable (image|mask) .*{said}"):
+            reads(tmp_path / "0.jpg")
 
 
 def test_a_folder_of_videos_lists_them(pictures, tmp_path):
