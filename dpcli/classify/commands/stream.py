@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,11 +14,11 @@ import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
-from dpcli.classify.data.likeness import like, tell_unlike, tell_values
+from dpcli.classify.data.likeness import like, tell_pace, tell_unlike, tell_values
 from dpcli.classify.data.videos import SILENT
 from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
-from dpcli.classify.stream.read_ahead import ReadAhead
+from dpcli.classify.stream.read_ahead import Pace, ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.counted import counted
 from dpcli.errors import DataError, DpcError, Stopped
@@ -92,8 +91,8 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
         watch = _IrregularFrames(info.timing == "slots")
-        tell = partial(_tell_unlike, task, info)
-        problem = _follow(predictor, frames, new_listener(speaker), stop, watch, tell)
+        unlike = _Unlike(task, info)
+        problem = _follow(predictor, frames, new_listener(speaker), stop, watch, unlike)
         if not predictor.clips:
             raise problem or _nothing_seen(task.source, watch.counts[_EMPTY])
         if target is not None:
@@ -150,12 +149,9 @@ def _follow(
     lines: Listener,
     stop: StopRequest,
     watch: _IrregularFrames,
-    tell_unlike_first: Callable[[list[np.ndarray]], None],
+    unlike: _Unlike,
 ) -> BaseException | None:
-    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did.
-
-    tell_unlike_first: compares the frames of the first window with what the model learned from.
-    """
+    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     window = predictor.window
     feed = ReadAhead(frames, 2 * window.size)
     problem: BaseException | None = None
@@ -163,6 +159,7 @@ def _follow(
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
+            unlike.tell_pace(arrived, waited)
             silent = waited if window.count else 0.0
             points = watch.see(window.count, points, silent)
             if not len(points):  # `dpc prepare` leaves such frames out, so the model learned from videos without them
@@ -170,7 +167,7 @@ def _follow(
             lines.see(points[:, :3], silent)
             made = predictor.add(points)
             if window.count == window.size:
-                tell_unlike_first(window.frames)
+                unlike.tell_first(window.frames)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
     except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
@@ -183,7 +180,7 @@ def _follow(
         log.info(f"{counted(window.count, 'frame')}, fewer than the window's {window.size}")
         lines.write(made, time.monotonic() - arrived, feed.waiting)
     if 0 < window.count < window.size:
-        tell_unlike_first(window.frames)
+        unlike.tell_first(window.frames)
     watch.sum_up()
     count = window.count
     if stop.requested and problem is None and stop.name == _CTRL_C:
@@ -195,12 +192,29 @@ def _follow(
     return problem
 
 
-def _tell_unlike(task: ModelTask, info: ModelInfo, first: list[np.ndarray]) -> None:
-    """Warns where the first frames f32 (P,3+F) of a stream are unlike what the model learned from, their columns too."""
-    tell_unlike(task.source, like([points[:, :3] for points in first]), info, task.model)
-    for place, name in enumerate(info.config.columns, start=3):
-        values = np.concatenate([points[:, place] for points in first])
-        tell_values(task.source, name, values, info, task.model, resting=True)
+class _Unlike:
+    """Warns where a stream is unlike what the model learned from."""
+
+    def __init__(self, task: ModelTask, info: ModelInfo) -> None:
+        self._task, self._info, self._pace = task, info, Pace()
+        self._paced = False
+
+    def tell_first(self, frames: list[np.ndarray]) -> None:
+        """Judges the first frames f32 (P,3+F), their columns too."""
+        source, info, model = self._task.source, self._info, self._task.model
+        tell_unlike(source, like([points[:, :3] for points in frames]), info, model)
+        for place, name in enumerate(info.config.columns, start=3):
+            values = np.concatenate([points[:, place] for points in frames])
+            tell_values(source, name, values, info, model, resting=True)
+
+    def tell_pace(self, arrived: float, waited: float) -> None:
+        """Judges, once it is known, the rate at which frames come; takes when each arrived and for how long it was waited for."""
+        if self._paced:
+            return
+        seconds = self._pace.see(arrived, waited)
+        if seconds is not None:
+            self._paced = True
+            tell_pace(self._task.source, seconds, self._info, self._task.model)
 
 
 class _IrregularFrames:

@@ -158,6 +158,22 @@ def tell_rate(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
         _tell_rate(reader, sequences, usual, f"in what {model} learned from")
 
 
+def tell_pace(what: str, seconds: float, info: ModelInfo, model: str | Path) -> None:
+    """Warns where frames of a stream, so many seconds apart, come faster or slower than in what a model of consecutive frames learned
+    from."""
+    usual = _own(info, model).get("interval")
+    if usual and info.timing == "clips" and not _same_rate(seconds, usual):
+        fewer = f"send one of {round(usual / seconds)}" if seconds < usual else "send more of them"
+        log.warn(
+            f"{what}: frames come {seconds:.3g} s apart, {usual:.3g} in what {model} learned from; clips are consecutive frames, so actions"
+            f" are {'slower' if seconds < usual else 'faster'} in them: {fewer}, or train with --timing uniform and give --window"
+        )
+
+
+def _same_rate(seconds: float, usual: float) -> bool:
+    return usual / _OTHER_RATE < seconds < usual * _OTHER_RATE
+
+
 def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], looks: dict[str, float], timing: str) -> None:
     """Warns where some training videos have another frame rate than most, of which clips of consecutive frames know nothing.
 
@@ -169,7 +185,7 @@ def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], looks: dict
 
 def _tell_rate(reader: CloudsReader, sequences: Sequence[int], usual: float, where: str) -> None:
     found = _intervals(reader, sequences)
-    others = [i for i, own in found.items() if not usual / _OTHER_RATE < own < usual * _OTHER_RATE]
+    others = [i for i, own in found.items() if not _same_rate(own, usual)]
     if others:
         log.warn(
             f"{reader.path}: another frame rate in {len(others)} of {counted(len(sequences), 'video')} (frames of"

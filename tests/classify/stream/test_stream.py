@@ -22,7 +22,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import Speaker, _IrregularFrames
+from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.commands.stream import Speaker, _IrregularFrames, _Unlike
 from dpcli.classify.confidence import Confidence
 from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, uniform_frames
 from dpcli.classify.network.config import KinetConfig
@@ -621,3 +622,31 @@ def test_a_silence_is_told_once_and_counted(capsys):
     said = capsys.readouterr().err
     assert said.count("nothing came for 7.3 s before frame 2") == 1 and "2.5 s" not in said
     assert "frames in all: 2 after a silence" in said
+
+
+@pytest.mark.parametrize(
+    ("gaps", "waited", "timing", "said"),
+    [
+        ([0.033] * 60, 1.0, "clips", "come 0.033 s apart, 0.0667 in what msraction3d-24 learned from"),
+        (
+            [0.0001] * 200 + [0.033, 0.034, 0.032] * 20,
+            0.9,
+            "clips",
+            "send one of 2",
+        ),  # a pipe was full of frames at first
+        ([0.2] * 60, 1.0, "clips", "faster in them: send more of them"),
+        ([0.06] * 60, 1.0, "clips", ""),
+        ([0.033] * 60, 1.0, "uniform", ""),
+        ([0.0001] * 500, 1.0, "clips", ""),  # a recording, sent at once
+        ([0.033] * 60, 0.1, "clips", ""),  # held back by slow predictions
+        ([0.1, 0.0001, 0.0001] * 60, 1.0, "clips", ""),  # a folder, where a look finds several
+    ],
+)
+def test_another_pace_than_that_of_the_training_is_told_once(gaps, waited, timing, said, capsys):
+    unlike = _Unlike(ModelTask("-", "msraction3d-24", None), ModelInfo(CONFIG, NAMES, timing))
+    arrived = 1000.0
+    for gap in gaps:
+        arrived += gap
+        unlike.tell_pace(arrived, gap * waited)
+    err = " ".join(capsys.readouterr().err.split())
+    assert said in err and err.count("warning") == bool(said)
