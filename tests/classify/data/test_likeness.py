@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dpcli.classify.commands.stream import _tell_unlike
+from dpcli.classify.commands.stream import _Unlike
 from dpcli.classify.commands.train import _tell_unlabeled
 from dpcli.classify.data.likeness import (
     NOTE,
@@ -248,9 +248,8 @@ def test_the_first_seconds_of_a_stream_may_show_nobody_who_moves(speed, told, ca
     (tmp_path / "m.safetensors").touch()
     config = KinetConfig(backbone="slots", widths=((64, 64), (96,)), columns=("v",), scales=(0.3, 0.0, 0.8))
     first = [np.column_stack([one[:20], speed * one[:20, 0] * 5]) for one in body()] + [np.zeros((0, 4))]
-    _tell_unlike(
-        SimpleNamespace(source="x", model=tmp_path / "m.safetensors"), ModelInfo(config, ["a"], "slots"), first
-    )
+    task = SimpleNamespace(source="x", model=tmp_path / "m.safetensors")
+    _Unlike(task, ModelInfo(config, ["a"], "slots")).tell_first(first)
     assert ("column v" in capsys.readouterr().err) == told
     tell_values("x", "v", np.zeros(0), ModelInfo(config, ["a"], "slots"), "runs/own")
     assert not capsys.readouterr().err
