@@ -195,28 +195,44 @@ def _folder_frames(folder: Path, follow: float, files: CloudFiles, columns: tupl
 
     A look costs what is new, since a folder of a day of frames is looked at as often as one of a minute.
     """
-    known: set[str] = set()  # names of files that were taken or left out
-    last, since, told = None, time.monotonic(), False
+    known: set[str] = set()  # names of files in the folder that were taken or left out
+    last, since, late, gone = None, time.monotonic(), 0, 0
     while True:
         with os.scandir(folder) as entries:
-            paths = [Path(entry.path) for entry in entries if entry.name not in known]
+            there = {entry.name for entry in entries}
+        known &= there  # whoever records may remove what is old
+        paths = [folder / name for name in there - known]
         paths = [path for path in paths if path.suffix.lower() in files.suffixes and not path.name.startswith(".")]
         keyed = sorted((files.order(path), path) for path in paths)
         fresh = [pair for pair in keyed if last is None or pair[0] > last]
-        late = [path.name for key, path in keyed if last is not None and key <= last]
-        if late and not told:
-            log.warn(f"{folder}: a file came after its successor by name and is left out; names must rise")
-            told = True
-        known.update(late)
+        for _, path in keyed[: len(keyed) - len(fresh)]:
+            late += 1
+            known.add(path.name)
+            _tell_lost(folder, late, f"{path.name} came after its successor by name and is left out; names must rise")
         for position, (key, path) in enumerate(fresh):
-            if position == len(fresh) - 1 and not _settled(path, since + follow):
-                break
-            yield as_frame(files.read(path, columns), str(path))
+            try:
+                if position == len(fresh) - 1 and not _settled(path, since + follow):
+                    break
+                frame = as_frame(files.read(path, columns), str(path))
+            except (OSError, DataError):
+                if path.exists():
+                    raise
+                gone += 1
+                what = f"{path.name} was removed before it was read, so its frame is lost"
+                _tell_lost(folder, gone, f"{what}; keep more files, or raise --hop where predictions take too long")
+                continue
+            yield frame
             known.add(path.name)
             last, since = key, time.monotonic()
         if not fresh and time.monotonic() - since >= follow:
             return
         time.sleep(_POLL)
+
+
+def _tell_lost(folder: Path, count: int, what: str) -> None:
+    """Warns of the first file that is lost, of the tenth, of the hundredth, and so on."""
+    if str(count).strip("0") == "1":
+        log.warn(f"{folder}: {what}" + (f" ({count} such files so far)" if count > 1 else ""))
 
 
 def _settled(path: Path, deadline: float) -> bool:

@@ -339,6 +339,19 @@ def test_a_folder_is_followed_in_order_of_names_and_half_a_file_is_waited_for(tm
     assert "left out" in capfd.readouterr().err
 
 
+def test_files_that_a_recorder_removes_are_counted_and_the_stream_goes_on(tmp_path, capsys):
+    """As a ring of the last files, whose reader was late."""
+    for number in range(30):
+        np.save(tmp_path / f"f{number:02}.npy", np.full((2, 3), number + 1, np.float32))
+    stream = open_frames(str(tmp_path), 0.3, cloud_files())
+    got = [float(next(stream)[0, 0]) for _ in range(3)]
+    for number in (0, 1, *range(3, 15)):
+        (tmp_path / f"f{number:02}.npy").unlink()
+    assert got + [float(frame[0, 0]) for frame in stream] == [1, 2, 3, *range(16, 31)]
+    err = " ".join(capsys.readouterr().err.split())
+    assert err.count("warning") == 2 and "f03.npy was removed before it was read" in err and "(10 such files" in err
+
+
 def test_a_look_into_a_folder_costs_what_is_new(tmp_path):
     """Not all files that have come so far, of which an hour brings tens of thousands."""
     files, ordered = cloud_files(), []
