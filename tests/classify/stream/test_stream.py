@@ -578,16 +578,36 @@ def test_a_reader_that_leaves_ends_it_and_scores_so_far_are_kept(model_file, tmp
 
 
 def test_a_writer_that_stops_within_a_frame_and_comes_back_loses_that_frame_alone(tmp_path, capsys):
+    """Wherever it stops: in the header, too, and within the bytes by which a frame is known."""
     frames = [np.full((n, 3), n, np.float32) for n in (50, 40, 3, 1)]
     first, cut, *rest = (as_stream([frame]) for frame in frames)
-    for place in (140, 300, len(cut) - 8):
-        path = tmp_path / f"{place}.npy"
+    path = tmp_path / "s.npy"
+    for place in (*range(1, 13), 60, *range(120, 132), 300, len(cut) - 8, len(cut) - 5):
         path.write_bytes(first + cut[:place] + first + b"".join(rest))
         found = [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())]
         assert found == [50, 50, 3, 1]
-        assert "frame 1: cut off after" in capsys.readouterr().err
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"frame 1, byte {len(first)}: cut off after {place} byte" in said
     path.write_bytes(first + cut[:200] + rest[0])  # what came back is smaller than what is missing
     assert [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())] == [50, 3]
+
+
+def test_coordinates_that_end_as_a_frame_begins_are_kept():
+    frame = np.frombuffer(bytes(8) + b"\x93NUM", np.float32).reshape(1, 3)
+    assert [one.tobytes() for one in through_a_pipe(as_stream([frame] * 2))] == [frame.tobytes()] * 2
+
+
+def test_a_named_pipe_is_followed_while_its_writer_is_gone(tmp_path):
+    """As a camera program that is started again; without --follow its end would be the stream's."""
+    path, frames = tmp_path / "pipe", random_frames(4)
+    os.mkfifo(path)
+    stream = open_frames(str(path), 60.0, cloud_files())
+    for some in (frames[:2], frames[2:]):
+        sender = threading.Thread(target=path.write_bytes, args=(as_stream(some),))
+        sender.start()
+        assert all(np.array_equal(next(stream), frame) for frame in some)
+        sender.join()
+    stream.close()
 
 
 def test_odd_frames_are_told_once_and_counted(model_file, tmp_path, capsys):
