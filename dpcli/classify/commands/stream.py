@@ -170,8 +170,6 @@ def _follow(
                 unlike.tell_first(window.frames)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
-    except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
-        return error
     except (DpcError, OSError, KeyboardInterrupt) as error:
         problem = error
     finally:
@@ -188,7 +186,10 @@ def _follow(
     elif stop.requested and problem is None:
         problem = Stopped(f"stopped by {stop.name} after {counted(count, 'frame')}; what came before is predicted")
     if predictor.clips:
-        lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
+        try:
+            lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
+        except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
+            problem = problem or error
     return problem
 
 
@@ -266,4 +267,5 @@ def _nothing_seen(source: str, empty: int) -> DataError:
 def _ending(problem: BaseException | None, stop: StopRequest) -> str:
     if problem is None:
         return "end of stream"
-    return {Stopped: f"stopped by {stop.name}", KeyboardInterrupt: "interrupted"}.get(type(problem), "bad frame")
+    endings = {Stopped: f"stopped by {stop.name}", KeyboardInterrupt: "interrupted", BrokenPipeError: "reader left"}
+    return endings.get(type(problem), "bad frame")

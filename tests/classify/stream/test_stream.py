@@ -564,15 +564,17 @@ def test_lines_come_while_the_stream_runs_memory_stays_and_ctrl_c_sums_up(model_
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_reader_that_leaves_ends_it_and_scores_so_far_are_kept(model_file, tmp_path, monkeypatch):
+def test_a_reader_that_leaves_ends_it_and_scores_and_page_so_far_are_kept(model_file, tmp_path, monkeypatch):
     (tmp_path / "x.npy").write_bytes(npy(GOOD) * 6)
     reader, writer = os.pipe()
     os.close(reader)
     with suppress(BrokenPipeError), os.fdopen(writer, "w") as closed:
         monkeypatch.setattr(sys, "stdout", closed)
         with pytest.raises(BrokenPipeError):
-            predict(str(tmp_path / "x.npy"), str(model_file), str(tmp_path / "s.h5"), stream=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.h5", "x.npy"]
+            page = tmp_path / "p.html"
+            predict(str(tmp_path / "x.npy"), str(model_file), str(tmp_path / "s.h5"), stream=True, page=page)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["p.html", "s.h5", "x.npy"]
+    assert "reader left" in page.read_text("utf-8")
     kept = ScoresReader(tmp_path / "s.h5")
     assert kept.names == ["x"] and 0 < kept.provenance[-1]["config"]["frames"] <= 6
 
