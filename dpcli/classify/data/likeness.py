@@ -72,6 +72,22 @@ def _longest_axis(found: dict[str, float]) -> str:
     return longest[1] if longest[0] > _LONG * other[0] else ""
 
 
+def tell_upright(what: str, found: dict[str, float], normalize: str) -> None:
+    """Warns where bodies, as `like` saw them, are to be made equally tall along y, and seem to stand along another axis."""
+    ahead, longest = _ahead(found), _longest_axis(found)
+    if normalize != "height" or longest == "y" or not (longest or ahead[1:] in ("x", "y")):
+        return
+    seen = (
+        f"is longest along {longest}"
+        if longest
+        else f"lies along {ahead} from the origin, as before sensors whose z is upright"
+    )
+    log.warn(
+        f"{what}: what is seen {seen}, and normalize=height makes bodies equally tall along y: is another axis the upright one? Then"
+        " their sizes would depend on what they do; exchange the axes in the raw data, or take --set normalize=unit"
+    )
+
+
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
     """Returns `like` in the median of some videos of a file, and of all of them the frames of the longest and, where their times
     are known, the median seconds from frame to frame."""
