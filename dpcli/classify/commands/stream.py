@@ -22,6 +22,7 @@ from dpcli.classify.stream.read_ahead import Pace, ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.counted import counted
 from dpcli.errors import DataError, DpcError, Stopped
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
@@ -94,7 +95,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
         unlike = _Unlike(task, info)
         problem = _follow(predictor, frames, new_listener(speaker), stop, watch, unlike)
         if not predictor.clips:
-            raise problem or _nothing_seen(task.source, watch.counts[_EMPTY])
+            raise problem or _nothing_seen(task, options.files.suffixes, watch.counts[_EMPTY])
         if target is not None:
             target.provenance.append(provenance.record(_record(task, options, info, predictor), task.seed))
             fused, *single = predictor.mean
@@ -258,10 +259,16 @@ class _IrregularFrames:
             log.warn("frames in all: " + ", ".join(f"{count} {kind}" for kind, count in self.counts.items() if count))
 
 
-def _nothing_seen(source: str, empty: int) -> DataError:
+def _nothing_seen(task: ModelTask, suffixes: Sequence[str], empty: int) -> DataError:
     if empty:
-        return DataError(f"{source}: none of its frames ({empty}) has a point, so there is nothing to recognize")
-    return DataError(f"{source}: not one frame came; the program before the pipe wrote nothing")
+        return DataError(f"{task.source}: none of its frames ({empty}) has a point, so there is nothing to recognize")
+    if task.data != "-" and Path(task.data).is_dir():
+        held = first_names(sorted(path.name for path in Path(task.data).iterdir()), 3) or "nothing"
+        return DataError(
+            f"{task.data}: no frame in it; expected point clouds ({first_names(suffixes, 6)}), and it holds {held}; --follow 60 waits"
+            " for them"
+        )
+    return DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
 
 
 def _ending(problem: BaseException | None, stop: StopRequest) -> str:
