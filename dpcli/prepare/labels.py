@@ -73,7 +73,7 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     become classes.
     """
     least = len(layout.split("/"))
-    parts = {name: name.split("/") for name in names}
+    parts = {name: _one_text(name).split("/") for name in names}
     short = [name for name, own in parts.items() if len(own) < least]
     if short:
         raise DataError(
@@ -136,7 +136,7 @@ def _warn_of_levels(root: Path, parts: list[list[str]]) -> None:
 
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:
     for record in records.values():
-        record["label"] = _WHOLE.sub(r"\1", record["label"])
+        record["label"] = _WHOLE.sub(r"\1", _one_text(record["label"]))
     words = {record["label"] for record in records.values()}
     labels = {0}
     if all(map(_is_number, words)):
@@ -201,13 +201,18 @@ def _people(path: Path, subjects: Iterable[str]) -> dict[str, str]:
     return {subject: numbers.get(own, own) for subject, own in whole.items()}
 
 
+def _one_text(name: str) -> str:
+    """Returns a name with its letters and their accents together: macOS and its archives take them apart."""
+    return unicodedata.normalize("NFC", name)
+
+
 def _one_spelling(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()
+    return _one_text(name).casefold()
 
 
 def _warn_of_classes(path: Path, class_names: list[str], labels: set[int]) -> None:
-    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals, in spaces and the
-    like, or in how letters are composed.
+    """Warns of numbers that leave the first class empty, and of classes whose names differ in capitals, in spaces and the like, or in
+    the width of letters.
     """
     if 0 not in labels:
         log.warn(f"{path}: no sample has label 0; labels count from 0, so that the first class stays empty")

@@ -61,7 +61,7 @@ def read_rows(path: Path, needed: str) -> dict[str, dict[str, str]]:
         lacking = not record.get(needed) or record[needed].lower() in _NOTHING
         if len(row) != len(header) or not record["name"] or lacking:
             unknown = f" (leave the line out where the {needed} isn't known)" if record["name"] and lacking else ""
-            raise DataError(f"{path}:{number}: {','.join(row)!r}; expected {','.join(header)}{unknown}")
+            raise DataError(f"{path}:{number}: {','.join(row)[:80]!r}; expected {','.join(header)}{unknown}")
         if record["name"] in records:
             raise DataError(f"{path}:{number}: {record['name']!r} appears twice")
         records[record["name"]] = record | {"line": str(number)}

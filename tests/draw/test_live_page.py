@@ -23,7 +23,7 @@ def write(path, frames: int = 40, names: tuple[str, ...] = ("wave </script>", "b
         page.see(rng.normal(size=(0 if frame == 5 else 1 + frame % 40, 3)).astype(np.float32), 0.0)
         if frame >= 7 and frame % 2:
             row = np.array([rows[int(frame >= 20)]], np.float32)
-            page.write(Prediction(frame, 1, row, row), 0.02, 0)
+            page.write(Prediction(frame, 1, row, row), 3.0 if frame == 18_003 else 0.02, 0)
     page.finish(np.array(rows[1:]), frames, 10, "end of stream")
 
 
@@ -78,6 +78,8 @@ def test_the_page_of_an_hour_is_no_larger_than_that_of_minutes(tmp_path):
     write(tmp_path / "short.html", frames=4000)
     write(tmp_path / "long.html", frames=20_000)
     assert (tmp_path / "long.html").stat().st_size < 1.3 * (tmp_path / "short.html").stat().st_size
+    text = (tmp_path / "long.html").read_text("utf-8")
+    assert "20 ms on average, at most 3000" in text and '"highest": 3000' in text, "of a prediction that isn't shown"
 
 
 @pytest.mark.parametrize("count", [1, 10, 11, 1000])

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,14 +14,15 @@ import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
-from dpcli.classify.data.likeness import like, tell_unlike, tell_values
+from dpcli.classify.data.likeness import like, tell_pace, tell_unlike, tell_values
 from dpcli.classify.data.videos import SILENT
 from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames, without_padding
-from dpcli.classify.stream.read_ahead import ReadAhead
+from dpcli.classify.stream.read_ahead import Pace, ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.counted import counted
 from dpcli.errors import DataError, DpcError, Stopped
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
@@ -92,10 +92,10 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
         watch = _IrregularFrames(info.timing == "slots")
-        tell = partial(_tell_unlike, task, info)
-        problem = _follow(predictor, frames, new_listener(told), stop, watch, tell)
+        unlike = _Unlike(task, info)
+        problem = _follow(predictor, frames, new_listener(told), stop, watch, unlike)
         if not predictor.clips:
-            raise problem or _nothing_seen(task.source, watch.counts[_EMPTY])
+            raise problem or _nothing_seen(task, options.files.suffixes, watch.counts[_EMPTY])
         if target is not None:
             target.provenance.append(provenance.record(_record(task, options, info, predictor), task.seed))
             fused, *single = predictor.mean
@@ -150,12 +150,9 @@ def _follow(
     lines: Listener,
     stop: StopRequest,
     watch: _IrregularFrames,
-    tell_unlike_first: Callable[[list[np.ndarray]], None],
+    unlike: _Unlike,
 ) -> BaseException | None:
-    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did.
-
-    tell_unlike_first: compares the frames of the first window with what the model learned from.
-    """
+    """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     window = predictor.window
     feed = ReadAhead(frames, 2 * window.size)
     problem: BaseException | None = None
@@ -163,6 +160,7 @@ def _follow(
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
+            unlike.tell_pace(arrived, waited)
             silent = waited if window.count else 0.0
             points = watch.see(window.count, points, silent)
             if not len(points):  # `dpc prepare` leaves such frames out, so the model learned from videos without them
@@ -170,11 +168,9 @@ def _follow(
             lines.see(points[:, :3], silent)
             made = predictor.add(points)
             if window.count == window.size:
-                tell_unlike_first(window.frames)
+                unlike.tell_first(window.frames)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
-    except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
-        return error
     except (DpcError, OSError, KeyboardInterrupt) as error:
         problem = error
     finally:
@@ -183,7 +179,7 @@ def _follow(
         log.info(f"{counted(window.count, 'frame')}, fewer than the window's {window.size}")
         lines.write(made, time.monotonic() - arrived, feed.waiting)
     if 0 < window.count < window.size:
-        tell_unlike_first(window.frames)
+        unlike.tell_first(window.frames)
     watch.sum_up()
     count = window.count
     if stop.requested and problem is None and stop.name == _CTRL_C:
@@ -191,16 +187,36 @@ def _follow(
     elif stop.requested and problem is None:
         problem = Stopped(f"stopped by {stop.name} after {counted(count, 'frame')}; what came before is predicted")
     if predictor.clips:
-        lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
+        try:
+            lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
+        except BrokenPipeError as error:  # nothing reads lines any more; scores so far are still worth their file
+            problem = problem or error
     return problem
 
 
-def _tell_unlike(task: ModelTask, info: ModelInfo, first: list[np.ndarray]) -> None:
-    """Warns where the first frames f32 (P,3+F) of a stream are unlike what the model learned from, their columns too."""
-    tell_unlike(task.source, like([points[:, :3] for points in first]), info, task.model)
-    for place, name in enumerate(info.config.columns, start=3):
-        values = np.concatenate([points[:, place] for points in first])
-        tell_values(task.source, name, values, info, task.model, resting=True)
+class _Unlike:
+    """Warns where a stream is unlike what the model learned from."""
+
+    def __init__(self, task: ModelTask, info: ModelInfo) -> None:
+        self._task, self._info, self._pace = task, info, Pace()
+        self._paced = False
+
+    def tell_first(self, frames: list[np.ndarray]) -> None:
+        """Judges the first frames f32 (P,3+F), their columns too."""
+        source, info, model = self._task.source, self._info, self._task.model
+        tell_unlike(source, like([points[:, :3] for points in frames]), info, model)
+        for place, name in enumerate(info.config.columns, start=3):
+            values = np.concatenate([points[:, place] for points in frames])
+            tell_values(source, name, values, info, model, resting=True)
+
+    def tell_pace(self, arrived: float, waited: float) -> None:
+        """Judges, once it is known, the rate at which frames come; takes when each arrived and for how long it was waited for."""
+        if self._paced:
+            return
+        seconds = self._pace.see(arrived, waited)
+        if seconds is not None:
+            self._paced = True
+            tell_pace(self._task.source, seconds, self._info, self._task.model)
 
 
 class _IrregularFrames:
@@ -243,13 +259,20 @@ class _IrregularFrames:
             log.warn("frames in all: " + ", ".join(f"{count} {kind}" for kind, count in self.counts.items() if count))
 
 
-def _nothing_seen(source: str, empty: int) -> DataError:
+def _nothing_seen(task: ModelTask, suffixes: Sequence[str], empty: int) -> DataError:
     if empty:
-        return DataError(f"{source}: none of its frames ({empty}) has a point, so there is nothing to recognize")
-    return DataError(f"{source}: not one frame came; the program before the pipe wrote nothing")
+        return DataError(f"{task.source}: none of its frames ({empty}) has a point, so there is nothing to recognize")
+    if task.data != "-" and Path(task.data).is_dir():
+        held = first_names(sorted(path.name for path in Path(task.data).iterdir()), 3) or "nothing"
+        return DataError(
+            f"{task.data}: no frame in it; expected point clouds ({first_names(suffixes, 6)}), and it holds {held}; --follow 60 waits"
+            " for them"
+        )
+    return DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
 
 
 def _ending(problem: BaseException | None, stop: StopRequest) -> str:
     if problem is None:
         return "end of stream"
-    return {Stopped: f"stopped by {stop.name}", KeyboardInterrupt: "interrupted"}.get(type(problem), "bad frame")
+    endings = {Stopped: f"stopped by {stop.name}", KeyboardInterrupt: "interrupted", BrokenPipeError: "reader left"}
+    return endings.get(type(problem), "bad frame")

@@ -22,6 +22,7 @@ from dpcli.classify.data.likeness import (
     tell_mixed_sizes,
     tell_rounded,
     tell_unlike,
+    tell_upright,
 )
 from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
 from dpcli.classify.data.slots import measured, preset_for
@@ -276,6 +277,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
         log.warn(f"{path}: {said}")
     looks = file_like(reader, training)
     tell_rounded(str(path), looks)
+    tell_upright(str(path), looks, settings.network.normalize)
     tell_mixed_rates(reader, training, looks, run.timing)
     if settings.network.normalize not in ANY_UNIT:
         tell_mixed_sizes(reader, sorted({*training, *validation}))

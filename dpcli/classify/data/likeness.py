@@ -72,6 +72,22 @@ def _longest_axis(found: dict[str, float]) -> str:
     return longest[1] if longest[0] > _LONG * other[0] else ""
 
 
+def tell_upright(what: str, found: dict[str, float], normalize: str) -> None:
+    """Warns where bodies, as `like` saw them, are to be made equally tall along y, and seem to stand along another axis."""
+    ahead, longest = _ahead(found), _longest_axis(found)
+    if normalize != "height" or longest == "y" or not (longest or ahead[1:] in ("x", "y")):
+        return
+    seen = (
+        f"is longest along {longest}"
+        if longest
+        else f"lies along {ahead} from the origin, as before sensors whose z is upright"
+    )
+    log.warn(
+        f"{what}: what is seen {seen}, and normalize=height makes bodies equally tall along y: is another axis the upright one? Then"
+        " their sizes would depend on what they do; exchange the axes in the raw data, or take --set normalize=unit"
+    )
+
+
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
     """Returns `like` in the median of some videos of a file, and of all of them the frames of the longest and, where their times
     are known, the median seconds from frame to frame."""
@@ -158,6 +174,22 @@ def tell_rate(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, m
         _tell_rate(reader, sequences, usual, f"in what {model} learned from")
 
 
+def tell_pace(what: str, seconds: float, info: ModelInfo, model: str | Path) -> None:
+    """Warns where frames of a stream, so many seconds apart, come faster or slower than in what a model of consecutive frames learned
+    from."""
+    usual = _own(info, model).get("interval")
+    if usual and info.timing == "clips" and not _same_rate(seconds, usual):
+        fewer = f"send one of {round(usual / seconds)}" if seconds < usual else "send more of them"
+        log.warn(
+            f"{what}: frames come {seconds:.3g} s apart, {usual:.3g} in what {model} learned from; clips are consecutive frames, so actions"
+            f" are {'slower' if seconds < usual else 'faster'} in them: {fewer}, or train with --timing uniform and give --window"
+        )
+
+
+def _same_rate(seconds: float, usual: float) -> bool:
+    return usual / _OTHER_RATE < seconds < usual * _OTHER_RATE
+
+
 def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], looks: dict[str, float], timing: str) -> None:
     """Warns where some training videos have another frame rate than most, of which clips of consecutive frames know nothing.
 
@@ -169,7 +201,7 @@ def tell_mixed_rates(reader: CloudsReader, sequences: Sequence[int], looks: dict
 
 def _tell_rate(reader: CloudsReader, sequences: Sequence[int], usual: float, where: str) -> None:
     found = _intervals(reader, sequences)
-    others = [i for i, own in found.items() if not usual / _OTHER_RATE < own < usual * _OTHER_RATE]
+    others = [i for i, own in found.items() if not _same_rate(own, usual)]
     if others:
         log.warn(
             f"{reader.path}: another frame rate in {len(others)} of {counted(len(sequences), 'video')} (frames of"

@@ -61,6 +61,7 @@ class LivePage:
         made = [("frame", np.int64), ("scores", np.float32, (len(self.class_names),)), ("latency", np.float64)]
         self._frames = Thinned(_MOST_FRAMES, np.dtype(frame))
         self._made = Thinned(_MOST_PREDICTIONS, np.dtype(made))
+        self._total, self._highest = 0.0, 0.0  # latency of all predictions, also of those that are not kept
 
     def see(self, points: np.ndarray, silent: float) -> None:
         """Takes a frame f32 (P,3) before it is predicted; silent: seconds since the one before."""
@@ -74,6 +75,7 @@ class LivePage:
     def write(self, made: Prediction, latency: float, waiting: int) -> None:
         """Takes a prediction; latency in seconds."""
         self._made.add((made.frame, made.scores[0], 1000 * latency))
+        self._total, self._highest = self._total + 1000 * latency, max(self._highest, 1000 * latency)
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """Writes the page. end: how the stream ended."""
@@ -84,12 +86,12 @@ class LivePage:
         hop = int(last[1] - last[0]) if len(last) > 1 else self.how.hop
         how = Cutting(self.how.window, hop, max(self.how.shortest, hop), confidence)
         segments = cut(WindowScores(last, scores, frames), self.class_names, how)
-        track = LiveTrack(last, confidence.of(scores), latency, segments, confidence.threshold)
+        track = LiveTrack(last, confidence.of(scores), latency, self._highest, segments, confidence.threshold)
         facts = PageFacts(
             self.title,
             f"{counted(frames, 'frame')}, {counted(clips, 'prediction')}; {end}",
             self._notes(),
-            self._rows(latency),
+            self._rows(),
         )
         facts.history.append({"command": self.command})
         write_page(live_page(facts, sequence, track, self.class_names), self.path)
@@ -98,11 +100,11 @@ class LivePage:
         thinned = ((self._frames, "frames"), (self._made, "predictions"))
         return [f"Of the {what} one in {one.every} is shown." for one, what in thinned if one.every > 1]
 
-    def _rows(self, latency: np.ndarray) -> list[tuple[str, str]]:
+    def _rows(self) -> list[tuple[str, str]]:
         own = self.how.confidence
         return [
             ("window", counted(self.how.window, "frame")),
             ("temperature", f"{own.temperature:g}"),
             ("nothing below", f"{own.threshold:g}" if own.threshold else "never"),
-            ("latency", f"{latency.mean():.0f} ms on average, at most {latency.max():.0f}"),
+            ("latency", f"{self._total / self._made.count:.0f} ms on average, at most {self._highest:.0f}"),
         ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,7 +21,8 @@ _PIECE = 1 << 20
 _ROUNDED = 1e-8  # what remains of 0 where points were turned
 _MOST_POINTS = 10_000_000  # in one frame: a damaged header must not ask for all memory
 _MOST_NUMBERS = 64  # of a point
-_MAGIC, _HDF5 = b"\x93NUMPY", b"\x89HDF"
+_BEGIN, _HDF5 = b"\x93NUMPY\x01\x00", b"\x89HDF"
+_TELLING = 3  # bytes of such a beginning, by which coordinates don't end
 _RECIPE = "expected frames written one after another by numpy.save(pipe, points)"
 
 
@@ -40,15 +40,17 @@ def open_frames(argument: str, follow: float, files: CloudFiles, columns: tuple[
     """Yields frames f32 (P,3+F) of `-` (stdin), a file or a folder, each as soon as it is whole.
 
     `columns`: what is read of a point beside its place, F names in order. `follow`: seconds to wait for more at the end of
-    a file or folder; a pipe ends when its writer closes it. Raises UsageError or DataError at once for what can't be read,
-    DataError from the iterator for a bad frame.
+    a file, a folder or a named pipe, whose writer may come back; stdin ends when its writer closes it. Raises UsageError or
+    DataError at once for what can't be read, DataError from the iterator for a bad frame.
     """
     if argument == "-":
         stream = standard_input()
         if stream.isatty():
             raise UsageError("- reads frames from a pipe, but stdin is a terminal; pipe a program into this one")
         if follow:
-            raise UsageError("--follow is for files and folders; a pipe ends when its writer closes it")
+            raise UsageError(
+                "--follow is for files, folders and named pipes (mkfifo); this one ends when its writer closes it"
+            )
         return read_arrays(stream.fileno(), "stdin", columns=columns)
     path = Path(argument)
     if not path.exists():
@@ -69,8 +71,13 @@ class _Bytes:
     waiting, and the interpreter can't end while another thread holds stdin's."""
 
     def __init__(self, descriptor: int, follow: float) -> None:
-        self.descriptor, self.ended, self.position, self._again = descriptor, False, 0, b""
-        self.follow = follow if stat.S_ISREG(os.fstat(descriptor).st_mode) else 0.0
+        self.descriptor, self.follow, self.ended, self.position = descriptor, follow, False, 0
+        self._again, self._frame = b"", [b""]
+
+    def begin_frame(self) -> int:
+        """Returns at which byte the next frame begins."""
+        self._frame = []
+        return self.position
 
     def read(self, count: int) -> bytes:
         """Returns `count` bytes; fewer, with `ended` set, when no more came for `follow` seconds."""
@@ -87,13 +94,21 @@ class _Bytes:
             else:
                 time.sleep(_POLL)
         self.position += count - missing
-        return b"".join(pieces)
+        self._frame.append(b"".join(pieces))
+        return self._frame[-1]
 
-    def unread(self, data: bytes) -> None:
-        """Takes back the last bytes that were read; the next read gives them again."""
-        self._again = data + self._again
-        self.position -= len(data)
-        self.ended = False
+    def back_to_next(self, least: int) -> int:
+        """Goes back to where another frame begins within this one, whose writer stopped in it and came back; returns how many of its
+        bytes came before, 0 where none begins. least: bytes at the end that are taken for a beginning until more are read."""
+        read = b"".join(self._frame)
+        lacking = next((len(_BEGIN) - k for k in range(len(_BEGIN) - 1, least - 1, -1) if read.endswith(_BEGIN[:k])), 0)
+        more = self.read(lacking)
+        cut = max((read + more).find(_BEGIN, 1), 0)
+        again = (read + more)[cut:] if cut else more
+        if again:
+            self._again, self.ended = again + self._again, False
+            self.position -= len(again)
+        return cut
 
 
 def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[str, ...] = ()) -> Iterator[np.ndarray]:
@@ -103,50 +118,60 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[
     """
     source, number = _Bytes(descriptor, follow), 0
     while True:
-        where, start = f"{name}: frame {number}", source.position
-        magic = source.read(8)
-        if not magic:
-            return
-        if magic[:4] == _HDF5:
-            raise DataError(f"{name}: HDF5 can't be read as it arrives; leave out --stream, or send {_RECIPE[9:]}")
-        if magic[:6] != _MAGIC[: len(magic)]:
-            raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
-        shape, fortran, dtype = _header(source, magic, where)
-        if 0 in shape:  # as of an empty list, [] or [[]], whatever the number of columns
-            shape = (0, 3 + len(columns))
-        if columns and shape[1] != 3 + len(columns):
-            raise DataError(
-                f"{where}: {shape[1]} numbers a point; the model reads {3 + len(columns)}: x, y, z, {', '.join(columns)}, in this"
-                " order"
-            )
-        if number == 0 and shape[1] > 3 + len(columns):
-            log.info(f"{name}: arrays of {shape[1]} columns; the first 3 are read, as x, y, z")
-            if shape[0] == 3:
-                log.warn(
-                    f"{where}: 3 rows of {shape[1]} numbers; if the rows are x, y and z, send the array transposed"
-                )
-        body = source.read(int(np.prod(shape)) * dtype.itemsize)
-        if (cut := body.find(_MAGIC + b"\x01\x00")) >= 0:  # no coordinates look like this: the next frame begins here
+        where, start = f"{name}: frame {number}", source.begin_frame()
+        try:
+            array = _next_array(source, name, number, columns)
+            cut = source.back_to_next(_TELLING)
+        except DataError:
+            cut = source.back_to_next(1)
+            if not cut:
+                raise
+        if cut:
             log.warn(
-                f"{where}: cut off after {source.position - len(body) + cut - start} bytes, then another frame begins;"
-                " its writer stopped and came back? The cut one is left out"
+                f"{where}, byte {start}: cut off after {counted(cut, 'byte')}, then another frame begins; its writer stopped and came"
+                " back? The cut one is left out"
             )
-            source.unread(body[cut:])
             continue
-        _check_whole(source, where)
-        array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
-        yield as_frame(array[:, : 3 + len(columns)], where)
+        if array is None:
+            return
+        yield as_frame(array, where)
         number += 1
+
+
+def _next_array(source: _Bytes, name: str, number: int, columns: tuple[str, ...]) -> np.ndarray | None:
+    """Returns the array (P,3+F) of frame `number`, None where the stream ends before it. Raises DataError for anything else."""
+    where, start = f"{name}: frame {number}", source.position
+    magic = source.read(8)
+    if not magic:
+        return None
+    if magic[:4] == _HDF5:
+        raise DataError(f"{name}: HDF5 can't be read as it arrives; leave out --stream, or send {_RECIPE[9:]}")
+    if magic[:6] != _BEGIN[:6][: len(magic)]:
+        raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
+    shape, fortran, dtype = _header(source, magic, where)
+    if 0 in shape:  # as of an empty list, [] or [[]], whatever the number of columns
+        shape = (0, 3 + len(columns))
+    if columns and shape[1] != 3 + len(columns):
+        raise DataError(
+            f"{where}: {shape[1]} numbers a point; the model reads {3 + len(columns)}: x, y, z, {', '.join(columns)}, in this order"
+        )
+    if number == 0 and shape[1] > 3 + len(columns):
+        log.info(f"{name}: arrays of {shape[1]} columns; the first 3 are read, as x, y, z")
+        if shape[0] == 3:
+            log.warn(f"{where}: 3 rows of {shape[1]} numbers; if the rows are x, y and z, send the array transposed")
+    body = source.read(int(np.prod(shape)) * dtype.itemsize)
+    _check_whole(source, where)
+    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")[:, : 3 + len(columns)]
 
 
 def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Returns shape, Fortran order and dtype of the array that follows, checked before any of it is read."""
     _check_whole(source, where)
-    if magic[6:] != b"\x01\x00":  # later versions are for headers of more than 64 kB, which no plain array has
+    if magic != _BEGIN:  # later versions are for headers of more than 64 kB, which no plain array has
         raise DataError(f"{where}: .npy version {magic[6]}.{magic[7]}, expected 1.0; {_RECIPE}")
     try:
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(source)
-    except ValueError as error:
+    except Exception as error:  # of a damaged one nearly any
         _check_whole(source, where)
         raise DataError(f"{where}: damaged .npy header ({error}); {_RECIPE}") from None
     if dtype.kind in "uif" and 0 in shape:
@@ -195,28 +220,44 @@ def _folder_frames(folder: Path, follow: float, files: CloudFiles, columns: tupl
 
     A look costs what is new, since a folder of a day of frames is looked at as often as one of a minute.
     """
-    known: set[str] = set()  # names of files that were taken or left out
-    last, since, told = None, time.monotonic(), False
+    known: set[str] = set()  # names of files in the folder that were taken or left out
+    last, since, late, gone = None, time.monotonic(), 0, 0
     while True:
         with os.scandir(folder) as entries:
-            paths = [Path(entry.path) for entry in entries if entry.name not in known]
+            there = {entry.name for entry in entries}
+        known &= there  # whoever records may remove what is old
+        paths = [folder / name for name in there - known]
         paths = [path for path in paths if path.suffix.lower() in files.suffixes and not path.name.startswith(".")]
         keyed = sorted((files.order(path), path) for path in paths)
         fresh = [pair for pair in keyed if last is None or pair[0] > last]
-        late = [path.name for key, path in keyed if last is not None and key <= last]
-        if late and not told:
-            log.warn(f"{folder}: a file came after its successor by name and is left out; names must rise")
-            told = True
-        known.update(late)
+        for _, path in keyed[: len(keyed) - len(fresh)]:
+            late += 1
+            known.add(path.name)
+            _tell_lost(folder, late, f"{path.name} came after its successor by name and is left out; names must rise")
         for position, (key, path) in enumerate(fresh):
-            if position == len(fresh) - 1 and not _settled(path, since + follow):
-                break
-            yield as_frame(files.read(path, columns), str(path))
+            try:
+                if position == len(fresh) - 1 and not _settled(path, since + follow):
+                    break
+                frame = as_frame(files.read(path, columns), str(path))
+            except (OSError, DataError):
+                if path.exists():
+                    raise
+                gone += 1
+                what = f"{path.name} was removed before it was read, so its frame is lost"
+                _tell_lost(folder, gone, f"{what}; keep more files, or raise --hop where predictions take too long")
+                continue
+            yield frame
             known.add(path.name)
             last, since = key, time.monotonic()
         if not fresh and time.monotonic() - since >= follow:
             return
         time.sleep(_POLL)
+
+
+def _tell_lost(folder: Path, count: int, what: str) -> None:
+    """Warns of the first file that is lost, of the tenth, of the hundredth, and so on."""
+    if str(count).strip("0") == "1":
+        log.warn(f"{folder}: {what}" + (f" ({count} such files so far)" if count > 1 else ""))
 
 
 def _settled(path: Path, deadline: float) -> bool:

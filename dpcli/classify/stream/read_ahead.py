@@ -5,11 +5,16 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
+from statistics import median
 
 import numpy as np
 
 from dpcli.runtime.signals import StopRequest
+
+_GAPS = 48  # between frames, by which a rate is judged: more than a pipe holds of what was sent before anybody read it
+_AT_ONCE = 0.005  # seconds; no camera is as fast, but a program that sends what it has recorded
 
 
 class ReadAhead:
@@ -62,3 +67,20 @@ class ReadAhead:
     def close(self) -> None:
         """Ends the thread once it looks up; what it has read is dropped."""
         self._closed.set()
+
+
+class Pace:
+    """Finds the rate of frames whose writer sets the pace, as a camera does: not a recording that is sent at once, nor frames that come
+    together or are held back here."""
+
+    def __init__(self) -> None:
+        self._gaps: deque[float] = deque(maxlen=_GAPS)
+        self._last = -np.inf
+
+    def see(self, arrived: float, waited: float) -> float | None:
+        """Takes the time at which a frame arrived and the seconds that it was waited for; returns the median seconds from frame to
+        frame, None until they are known."""
+        gap, self._last = arrived - self._last, arrived
+        self._gaps.append(gap if _AT_ONCE < gap < 2 * waited else 0.0)
+        paced = [gap for gap in self._gaps if gap]
+        return median(paced) if 4 * len(paced) >= 3 * _GAPS else None

@@ -57,7 +57,8 @@ class StreamOptions:
     follow: Annotated[
         float | None,
         typer.Option(
-            "--follow", help="With --stream: seconds to wait for more at the end of a file or folder. Default: 0."
+            "--follow",
+            help="With --stream: seconds to wait for more at the end of a file, folder or named pipe. Default: 0.",
         ),
     ] = None
     json_output: Annotated[bool, typer.Option("--json", help="With --stream: one JSON object per line.")] = False

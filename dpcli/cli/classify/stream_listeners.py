@@ -45,7 +45,7 @@ def listener(model: StreamModel, as_json: bool, page: Path | None, source: str) 
     in_place = sys.stdout.isatty() and os.environ.get("TERM") != "dumb" and not as_json
     several: list[Listener] = [View(model, lines) if in_place else lines]
     if page is not None:
-        several.append(_page(model, page, source))
+        several.insert(0, _page(model, page, source))  # it is written, too, where whoever reads the lines has left
     return Several(several)
 
 

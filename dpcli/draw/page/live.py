@@ -24,12 +24,14 @@ class Stretch(Protocol):
 
 @dataclass(frozen=True)
 class LiveTrack:
-    """Holds predictions in order: last frame of each i64 (N), probabilities f (N,C), latency f (N) in ms; then the stretches
-    that they were cut into, and the threshold of probability below which nothing is recognized (0: never)."""
+    """Holds predictions in order: last frame of each i64 (N), probabilities f (N,C), latency f (N) in ms; then the highest
+    latency, also of predictions that are left out, the stretches that they were cut into, and the threshold of probability
+    below which nothing is recognized (0: never)."""
 
     frames: np.ndarray
     probabilities: np.ndarray
     latency: np.ndarray
+    highest: float
     segments: Sequence[Stretch]
     threshold: float
 
@@ -44,6 +46,7 @@ def live_page(facts: PageFacts, sequence: PageSequence, track: LiveTrack, class_
         "colors": part_colors(np.arange(len(class_names))).tolist(),
         "frames": track.frames.tolist(),
         "latency": [round(float(one), 1) for one in track.latency],
+        "highest": track.highest,
         "segments": [[one.start, one.end, one.name, round(one.confidence, 3)] for one in track.segments],
         "threshold": track.threshold,
     }

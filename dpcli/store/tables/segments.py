@@ -178,7 +178,10 @@ def _whole(where: str, key: str, value: Any) -> int:
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if isinstance(value, bool) or not 0 <= number < _MOST_FRAMES or number != int(number):
-        raise DataError(f"{where}: {key} {value!r}; expected a frame's number, from 0 to {_MOST_FRAMES:,}")
+        raise DataError(
+            f"{where}: {key} {value!r}; expected a frame's number, whole and from 0 to {_MOST_FRAMES:,} (of seconds: times the frame"
+            " rate)"
+        )
     return int(number)
 
 

@@ -90,3 +90,15 @@ def test_a_stream_of_silent_frames_alone_is_told(tmp_path, capsys):
             np.save(stream, np.zeros((rows, 3), np.float32))
     assert dpc("classify", "predict", tmp_path / "s.npy", "--stream", "--model", model) == 3
     assert "none of its frames (3) has a point" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [((), "holds nothing"), (("depth_1.png", "cam0"), ".npy and 18 more), and it holds cam0, depth_1.png")],
+)
+def test_a_folder_without_point_clouds_is_told_what_is_expected(held, said, tmp_path, capsys):
+    model, folder = untrained(tmp_path / "m.safetensors", radar=False), tmp_path / "frames"
+    for name in ("", *held):
+        (folder / name).mkdir()
+    assert dpc("classify", "predict", folder, "--stream", "--model", model) == 3
+    assert said in " ".join(capsys.readouterr().err.split())

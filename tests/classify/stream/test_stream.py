@@ -22,7 +22,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import StreamModel, _IrregularFrames
+from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.commands.stream import StreamModel, _IrregularFrames, _Unlike
 from dpcli.classify.confidence import Confidence
 from dpcli.classify.data.clips import Clip, ClipSource, OneVideo, uniform_frames
 from dpcli.classify.network.config import KinetConfig
@@ -338,6 +339,19 @@ def test_a_folder_is_followed_in_order_of_names_and_half_a_file_is_waited_for(tm
     assert "left out" in capfd.readouterr().err
 
 
+def test_files_that_a_recorder_removes_are_counted_and_the_stream_goes_on(tmp_path, capsys):
+    """As a ring of the last files, whose reader was late."""
+    for number in range(30):
+        np.save(tmp_path / f"f{number:02}.npy", np.full((2, 3), number + 1, np.float32))
+    stream = open_frames(str(tmp_path), 0.3, cloud_files())
+    got = [float(next(stream)[0, 0]) for _ in range(3)]
+    for number in (0, 1, *range(3, 15)):
+        (tmp_path / f"f{number:02}.npy").unlink()
+    assert got + [float(frame[0, 0]) for frame in stream] == [1, 2, 3, *range(16, 31)]
+    err = " ".join(capsys.readouterr().err.split())
+    assert err.count("warning") == 2 and "f03.npy was removed before it was read" in err and "(10 such files" in err
+
+
 def test_a_look_into_a_folder_costs_what_is_new(tmp_path):
     """Not all files that have come so far, of which an hour brings tens of thousands."""
     files, ordered = cloud_files(), []
@@ -550,30 +564,52 @@ def test_lines_come_while_the_stream_runs_memory_stays_and_ctrl_c_sums_up(model_
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_reader_that_leaves_ends_it_and_scores_so_far_are_kept(model_file, tmp_path, monkeypatch):
+def test_a_reader_that_leaves_ends_it_and_scores_and_page_so_far_are_kept(model_file, tmp_path, monkeypatch):
     (tmp_path / "x.npy").write_bytes(npy(GOOD) * 6)
     reader, writer = os.pipe()
     os.close(reader)
     with suppress(BrokenPipeError), os.fdopen(writer, "w") as closed:
         monkeypatch.setattr(sys, "stdout", closed)
         with pytest.raises(BrokenPipeError):
-            predict(str(tmp_path / "x.npy"), str(model_file), str(tmp_path / "s.h5"), stream=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.h5", "x.npy"]
+            page = tmp_path / "p.html"
+            predict(str(tmp_path / "x.npy"), str(model_file), str(tmp_path / "s.h5"), stream=True, page=page)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["p.html", "s.h5", "x.npy"]
+    assert "reader left" in page.read_text("utf-8")
     kept = ScoresReader(tmp_path / "s.h5")
     assert kept.names == ["x"] and 0 < kept.provenance[-1]["config"]["frames"] <= 6
 
 
 def test_a_writer_that_stops_within_a_frame_and_comes_back_loses_that_frame_alone(tmp_path, capsys):
+    """Wherever it stops: in the header, too, and within the bytes by which a frame is known."""
     frames = [np.full((n, 3), n, np.float32) for n in (50, 40, 3, 1)]
     first, cut, *rest = (as_stream([frame]) for frame in frames)
-    for place in (140, 300, len(cut) - 8):
-        path = tmp_path / f"{place}.npy"
+    path = tmp_path / "s.npy"
+    for place in (*range(1, 13), 60, *range(120, 132), 300, len(cut) - 8, len(cut) - 5):
         path.write_bytes(first + cut[:place] + first + b"".join(rest))
         found = [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())]
         assert found == [50, 50, 3, 1]
-        assert "frame 1: cut off after" in capsys.readouterr().err
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"frame 1, byte {len(first)}: cut off after {place} byte" in said
     path.write_bytes(first + cut[:200] + rest[0])  # what came back is smaller than what is missing
     assert [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())] == [50, 3]
+
+
+def test_coordinates_that_end_as_a_frame_begins_are_kept():
+    frame = np.frombuffer(bytes(8) + b"\x93NUM", np.float32).reshape(1, 3)
+    assert [one.tobytes() for one in through_a_pipe(as_stream([frame] * 2))] == [frame.tobytes()] * 2
+
+
+def test_a_named_pipe_is_followed_while_its_writer_is_gone(tmp_path):
+    """As a camera program that is started again; without --follow its end would be the stream's."""
+    path, frames = tmp_path / "pipe", random_frames(4)
+    os.mkfifo(path)
+    stream = open_frames(str(path), 60.0, cloud_files())
+    for some in (frames[:2], frames[2:]):
+        sender = threading.Thread(target=path.write_bytes, args=(as_stream(some),))
+        sender.start()
+        assert all(np.array_equal(next(stream), frame) for frame in some)
+        sender.join()
+    stream.close()
 
 
 def test_odd_frames_are_told_once_and_counted(model_file, tmp_path, capsys):
@@ -621,3 +657,31 @@ def test_a_silence_is_told_once_and_counted(capsys):
     said = capsys.readouterr().err
     assert said.count("nothing came for 7.3 s before frame 2") == 1 and "2.5 s" not in said
     assert "frames in all: 2 after a silence" in said
+
+
+@pytest.mark.parametrize(
+    ("gaps", "waited", "timing", "said"),
+    [
+        ([0.033] * 60, 1.0, "clips", "come 0.033 s apart, 0.0667 in what msraction3d-24 learned from"),
+        (
+            [0.0001] * 200 + [0.033, 0.034, 0.032] * 20,
+            0.9,
+            "clips",
+            "send one of 2",
+        ),  # a pipe was full of frames at first
+        ([0.2] * 60, 1.0, "clips", "faster in them: send more of them"),
+        ([0.06] * 60, 1.0, "clips", ""),
+        ([0.033] * 60, 1.0, "uniform", ""),
+        ([0.0001] * 500, 1.0, "clips", ""),  # a recording, sent at once
+        ([0.033] * 60, 0.1, "clips", ""),  # held back by slow predictions
+        ([0.1, 0.0001, 0.0001] * 60, 1.0, "clips", ""),  # a folder, where a look finds several
+    ],
+)
+def test_another_pace_than_that_of_the_training_is_told_once(gaps, waited, timing, said, capsys):
+    unlike = _Unlike(ModelTask("-", "msraction3d-24", None), ModelInfo(CONFIG, NAMES, timing))
+    arrived = 1000.0
+    for gap in gaps:
+        arrived += gap
+        unlike.tell_pace(arrived, gap * waited)
+    err = " ".join(capsys.readouterr().err.split())
+    assert said in err and err.count("warning") == bool(said)

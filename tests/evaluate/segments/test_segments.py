@@ -120,7 +120,7 @@ def test_the_command_compares_tables_in_any_form_and_order(tmp_path):
         ("a,10,10,wave\n", "not after its start"),
         ("a,-1,10,wave\n", "line 2: start '-1'"),
         ("a,0,1e99,wave\n", "end '1e99'"),
-        ("a,0.5,3,wave\n", "a frame's number"),
+        ("a,0.5,3,wave\n", "a frame's number, whole and from 0 to 20,000,000 (of seconds: times the frame rate)"),
         ("a,x,3,wave\n", "start 'x'"),
         (",0,3,wave\n", "recording ''"),
         ("a,0\n", "end None"),

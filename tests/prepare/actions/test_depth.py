@@ -335,6 +335,7 @@ def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
         ("name,label\na,1,2\n", "labels.csv:2: 'a,1,2'; expected name,label"),
         ("name,label\na,\n", "labels.csv:2: 'a,'; expected name,label .leave the line out where the label isn't known"),
         ("name,label\na\n", "labels.csv:2"),
+        (50 * '{"name":"a","label":1},', "labels.csv:1: '{.{70,90}'; expected name,label$"),  # not all of it
         ("name,color\na,1\n", "labels.csv:1: columns name,color"),
         ("name,label\na,1\nb,two\n", "some labels are numbers and some are words"),
         ("name,label,subject\na,1,x1y\n", "labels.csv:2: subject 'x1y'"),

@@ -108,7 +108,7 @@ class LivePage extends PointsPage {
     title(`confidence, as it was said${below}`, `confidence${below}`);
     this.paintSure(pen, top, line);
     top += SURE + SPACE + 14;
-    title(`latency, at most ${Math.max(...this.live.latency).toFixed(0)} ms`);
+    title(`latency, at most ${this.live.highest.toFixed(0)} ms`);
     this.paintDelay(pen, top, faint);
   }
 
@@ -141,7 +141,7 @@ class LivePage extends PointsPage {
   }
 
   paintDelay(pen, top, faint) {
-    const { frames, latency } = this.live, most = Math.max(...latency, 1);
+    const { frames, latency, highest } = this.live, most = Math.max(highest, 1);
     pen.fillStyle = faint;
     frames.forEach((frame, at) => {
       const from = this.x(frame), to = this.x(frames[at + 1] ?? this.clip.about.frame_count), high = DELAY * latency[at] / most;
