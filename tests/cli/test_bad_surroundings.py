@@ -444,6 +444,19 @@ def test_who_has_no_home_gets_no_folder_called_like_it(monkeypatch):
     assert os.path.expanduser("~/.cache") == "/dev/null/.cache"
 
 
+@pytest.mark.parametrize(("given", "variable"), [(["-OO", "-m", "dpcli"], "1"), (["-m", "dpcli"], "2")])
+def test_docstrings_are_kept_since_they_are_the_help(monkeypatch, given, variable):
+    """Python drops them where it is asked to, as some images of containers do for all programs."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.setenv("PYTHONOPTIMIZE", variable)
+    monkeypatch.setattr("sys.orig_argv", [sys.executable, *given, "info"])
+    monkeypatch.setattr("sys.flags", Mock(optimize=2))
+    monkeypatch.setattr("os.execv", started := Mock())
+    settle_interpreter()
+    started.assert_called_once_with(sys.executable, [sys.executable, "-m", "dpcli", "info"])
+    assert "PYTHONOPTIMIZE" not in os.environ
+
+
 def test_what_a_terminal_can_not_show_is_spelled(named):
     ascii_only = {"PYTHONUTF8": "0", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0"}
     shutil.copy(named, other := named.with_name("p\u00fcnch.h5"))  # the same text as name of a file and of a class
