@@ -1,4 +1,4 @@
-"""Settles what Python itself takes from its surroundings: encoding, docstrings, the current folder's modules, the home folder."""
+"""Settles what the program takes from its surroundings: encoding, docstrings, the current folder's modules, home, backend."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ def settle_interpreter() -> None:
 
     Who has neither HOME nor an entry among the system's users, as in some containers, has a home where nothing can be made:
     libraries would keep their caches in a folder called ~ beside the user's files.
+
+    Matplotlib draws into files alone, whichever backend for windows MPLBACKEND names: one that it no longer has, such as
+    Qt4Agg, would end each command that imports it.
     """
     bare = sys.flags.optimize > 1
     given = sys.orig_argv[1:]
@@ -29,6 +32,6 @@ def settle_interpreter() -> None:
     asked = bare and os.environ.pop("PYTHONOPTIMIZE", "")
     if sys.executable and (words != given or asked):
         os.execv(sys.executable, [sys.executable, *words])
-    os.environ["PYTHONSAFEPATH"] = "1"
+    os.environ.update(PYTHONSAFEPATH="1", MPLBACKEND="agg")
     if os.path.expanduser("~") == "~":
         os.environ["HOME"] = os.devnull
