@@ -25,8 +25,12 @@ def load_open3d() -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
+        lacking = (
+            "the system lacks a library that Open3D asks for; of Debian and Ubuntu: apt install libegl1 libgl1 libx11-6"
+        )
+        advice = "pip install open3d libusb-package" if isinstance(error, ModuleNotFoundError) else lacking
         raise DpcError(
-            f"Open3D cannot be imported ({error}); it reads .ply and .pcd: pip install open3d libusb-package"
+            f"Open3D, which casts rays and registers scans here, cannot be imported ({error}); {advice}"
         ) from None
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d

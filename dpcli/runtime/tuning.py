@@ -6,6 +6,7 @@ import ctypes
 import functools
 import importlib
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,11 @@ def tune_environment() -> None:
     `classify train --preset quick` (8 clips) took 0.62 s instead of 1.5 s, best of 24 on two cores that others used, too.
     A large tensor in pages of 4 kB takes longer to get from the system than to fill: large pages made static training of
     large clips 1.5 times as fast (docs/experiments/speed.md); twelve small clips gain nothing by them.
+
+    Numba doesn't import where it is given no thread, by which people mean as many as there are CPUs.
     """
+    if re.fullmatch(r"\s*(-\d+|0+)\s*", os.environ.get("NUMBA_NUM_THREADS", "")):
+        del os.environ["NUMBA_NUM_THREADS"]
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
@@ -116,12 +121,21 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def numba_threads_as_torch() -> None:
-    """Gives numba's own threads the number that torch uses, and torch its number back, which numba changes with its own."""
+    """Gives numba's own threads the number that torch uses, and torch its number back, which numba changes with its own.
+
+    Where NUMBA_THREADING_LAYER asks for threads of a library that isn't there, as TBB's, numba chooses others.
+    """
     import numba
     import torch
 
     threads = torch.get_num_threads()
-    numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
+    count = max(1, min(threads, numba.config.NUMBA_NUM_THREADS))
+    try:
+        numba.set_num_threads(count)
+    except ValueError:
+        os.environ.pop("NUMBA_THREADING_LAYER", None)
+        numba.config.THREADING_LAYER = "default"
+        numba.set_num_threads(count)
     if torch.get_num_threads() != threads:  # starting its own threads, numba gives OpenMP, and so torch, as many
         torch.set_num_threads(threads)
 

@@ -20,6 +20,7 @@ from unittest.mock import Mock
 import h5py
 import numpy as np
 import pytest
+from matplotlib.rcsetup import validate_backend
 
 from dpcli.interpreter import settle_interpreter
 from dpcli.segment.training.flow_store import FlowStore
@@ -438,10 +439,34 @@ def test_a_current_folder_that_was_removed_is_said(named, tmp_path, words):
 def test_who_has_no_home_gets_no_folder_called_like_it(monkeypatch):
     """A container's user without HOME and without an entry among the system's: numba kept its cache in ./~"""
     monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.setenv("MPLBACKEND", "")
     monkeypatch.delenv("HOME")
     monkeypatch.setattr("pwd.getpwuid", Mock(side_effect=KeyError))
     settle_interpreter()
     assert os.path.expanduser("~/.cache") == "/dev/null/.cache"
+
+
+def test_a_backend_that_matplotlib_no_longer_has_draws_no_picture(monkeypatch):
+    """Old settings of shells name it; each picture and page ended as a bug."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.setenv("MPLBACKEND", "Qt4Agg")
+    with pytest.raises(ValueError, match="not a valid value for backend"):
+        validate_backend(os.environ["MPLBACKEND"])
+    settle_interpreter()
+    validate_backend(os.environ["MPLBACKEND"])
+
+
+@pytest.mark.parametrize(("given", "variable"), [(["-OO", "-m", "dpcli"], "1"), (["-m", "dpcli"], "2")])
+def test_docstrings_are_kept_since_they_are_the_help(monkeypatch, given, variable):
+    """Python drops them where it is asked to, as some images of containers do for all programs."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.setenv("PYTHONOPTIMIZE", variable)
+    monkeypatch.setattr("sys.orig_argv", [sys.executable, *given, "info"])
+    monkeypatch.setattr("sys.flags", Mock(optimize=2))
+    monkeypatch.setattr("os.execv", started := Mock())
+    settle_interpreter()
+    started.assert_called_once_with(sys.executable, [sys.executable, "-m", "dpcli", "info"])
+    assert "PYTHONOPTIMIZE" not in os.environ
 
 
 def test_what_a_terminal_can_not_show_is_spelled(named):

@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import pytest
 
 from dpcli.ops.cpu import jit
+from dpcli.runtime.tuning import tune_environment
 
 PACKAGE = Path(jit.__file__).parents[2]
 KERNEL = """
@@ -46,10 +47,17 @@ def test_a_kernel_is_compiled_once_and_the_user_is_told(tmp_path):
 
 
 def test_a_switch_for_code_of_a_user_s_own_leaves_kernels_compiled(tmp_path, monkeypatch):
-    """NUMBA_DISABLE_JIT=1, as people set it to debug; numba looks at it again when another variable of its own changes."""
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    """NUMBA_DISABLE_JIT=1, as people set it to debug; numba looks at it again when another variable of its own changes.
+    A threading layer that isn't installed, and no threads, which stand for all in other programs, ended commands as bugs.
+    """
+    for name, value in {"DISABLE_JIT": "1", "THREADING_LAYER": "absent", "NUM_THREADS": "0"}.items():
+        monkeypatch.setenv(f"NUMBA_{name}", value)
+    tune_environment()
+    assert "NUMBA_NUM_THREADS" not in os.environ
+    fake = "import sys\nfrom unittest.mock import Mock\nsys.modules['torch'] = Mock(get_num_threads=lambda: 1)\n"
+    threads = f"{fake}from dpcli.runtime.tuning import numba_threads_as_torch\nnumba_threads_as_torch()\n"
     (tmp_path / "own.py").write_text(
-        f"import os, numba\nos.environ['NUMBA_NUM_THREADS'] = '1'\nnumba.core.config.reload_config()\n{TWICE}"
+        f"import os, numba\n{threads}os.environ['NUMBA_OPT'] = '2'\nnumba.core.config.reload_config()\n{TWICE}"
     )
     assert run(tmp_path, "any", patience=60) == ("6.0 0 1", "")
 

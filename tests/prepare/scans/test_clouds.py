@@ -245,12 +245,25 @@ def test_folders_without_clouds(tmp_path):
         CloudFolders(tmp_path, label_from_folder=True).items()
 
 
-def test_a_missing_open3d_is_explained(monkeypatch):
+@pytest.mark.parametrize(
+    ("content", "advice"),
+    [
+        ("import no_such_module_at_all", "pip install open3d libusb-package"),
+        (
+            "import ctypes; ctypes.CDLL('libnone.so.1')",
+            r"libnone.so.1: cannot open .*apt install libegl1 libgl1 libx11-6",
+        ),
+    ],
+)
+def test_why_open3d_cannot_be_imported_is_told(monkeypatch, tmp_path, content, advice):
+    """Open3D's wheel links to libraries of screens, which images of containers and small servers lack."""
     from dpcli.errors import DpcError
 
     load_open3d.cache_clear()
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(DpcError, match="pip install open3d libusb-package"):
+    (tmp_path / "open3d.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(DpcError, match=advice):
         load_open3d()
     load_open3d.cache_clear()
 
