@@ -13,11 +13,12 @@ from dpcli.segment.rigid_motions import move
 _SCALES = ((1.0, 3.0), (0.5, 1.2), (0.3, 0.5))  # voxel and farthest partner, meters
 _STEP = 2.5  # meters between the starts of the search
 _STEPS = {0: 20, 1: 20, 2: 30}
-_BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
+_BETTER = 0.97  # of the distances at rest that a motion must leave, or the sensor stood
 _DIGITS = 9  # of a motion that are kept: Open3D adds in the order in which threads end, and the last digits differ
 _ACROSS = 0.08  # mean square of the normals along the level direction that they show least, if they show it well
-_NEAR = 0.5  # meters: a point this near to the other frame's has a partner
-OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
+_NEAR = 0.5  # meters from the other frame's surface at which a point is as far away as it counts
+_MET = 0.15  # meters from that surface below which a point has a partner
+OVERLAP = 0.35  # share of points with a partner below which two frames are not of one place
 
 
 def register_frames(frames: list[np.ndarray], ground: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -69,15 +70,18 @@ def _register_pair(source: list, target: list, before: np.ndarray) -> tuple[np.n
         starts.append(start)
     tree = cKDTree(np.asarray(target[1].points))
     found = [_icp(source[0], target[0], start, 0) for start in starts]
-    some = sorted(found, key=lambda motion: _misfit(source[1], target[1], tree, motion)[0])[:2]
+    some = sorted(found, key=lambda motion: _away(source[1], target[1], tree, motion).mean())[:2]
     ends = []
     for motion in some:
         for scale in (1, 2):
             motion = _icp(source[scale], target[scale], motion, scale)
-        ends.append((*_misfit(source[1], target[1], tree, motion), motion))
-    rest = (*_misfit(source[1], target[1], tree, np.eye(4)), np.eye(4))
-    misfit, share, motion = min(ends, key=lambda end: end[0])
-    return (motion, share) if misfit < _BETTER * rest[0] else (rest[2], rest[1])
+        ends.append((_away(source[1], target[1], tree, motion), motion))
+    away, motion = min(ends, key=lambda end: end[0].mean())
+    rest = _away(source[1], target[1], tree, np.eye(4))
+    met = np.minimum(away, rest) < _NEAR
+    if away[met].sum() >= _BETTER * rest[met].sum():
+        away, motion = rest, np.eye(4)
+    return motion, float((away < _MET).mean())
 
 
 def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:
@@ -89,11 +93,11 @@ def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:
     return np.round(found, _DIGITS) + 0.0  # no -0
 
 
-def _misfit(source, target, tree: cKDTree, motion: np.ndarray) -> tuple[float, float]:
-    """Returns the mean distance to the target's surface, cut at `_NEAR`, and the share of points nearer than that to a point.
+def _away(source, target, tree: cKDTree, motion: np.ndarray) -> np.ndarray:
+    """Returns the distances (N) of the source's points to the target's surface, cut at `_NEAR`.
 
     To the surface, because the beams move with the sensor: their rings on the ground and on walls lie on one another where
-    no motion is assumed.
+    no motion is assumed, and those of a solid-state lidar, which differ from frame to frame, pass one another.
     """
     moved = move(motion, np.asarray(source.points))
     distance, partner = tree.query(moved, distance_upper_bound=2 * _NEAR)
@@ -102,4 +106,4 @@ def _misfit(source, target, tree: cKDTree, motion: np.ndarray) -> tuple[float, f
     away = np.full(len(moved), _NEAR)
     across = (moved[met] - np.asarray(target.points)[partner]) * np.asarray(target.normals)[partner]
     away[met] = np.minimum(np.abs(across.sum(1)), _NEAR)
-    return float(away.mean()), float((distance < _NEAR).mean())
+    return away

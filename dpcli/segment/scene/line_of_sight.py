@@ -11,6 +11,7 @@ _NEIGHBORS = 6
 _SAMPLE = 4000  # points that tell where the sensor stood
 _ROWS = 1.2  # distances between rows that beams lie beside a place: the rows below and above it, of which one may see over an edge
 _AIMED = 0.1  # distances between rows up to which a single row meets a place
+_NO_ROWS = 2.0  # times the distance between rows that even beams have from which on there are no rows
 _SAME_ROW = 0.8  # the same for beams of one row
 
 
@@ -58,13 +59,21 @@ class LineOfSight:
 
 
 def _beam_spacing(direction: np.ndarray) -> tuple[float, float]:
-    """Returns the angles between rows of beams and along a row, radians, from the directions (N,2) of a frame's points."""
+    """Returns the angles between rows of beams and along a row, radians, from the directions (N,2) of a frame's points.
+
+    Both are the distance of as many even beams where there are no rows: the beams of some solid-state lidars follow curves
+    that cross one another, along which they are much denser.
+    """
     degree = np.radians(1)
     sector = np.floor(direction[:, 0] / (0.5 * degree)).astype(int)
     order = np.lexsort((direction[:, 1], sector))
     gap = np.diff(direction[order, 1])[np.diff(sector[order]) == 0]
     gap = gap[gap > 0.05 * degree]
     across = float(np.clip(np.median(gap) if len(gap) else degree, 0.1 * degree, 2.5 * degree))
+    seen = len(np.unique(np.floor(direction / degree), axis=0))  # square degrees
+    even = degree * float(np.sqrt(seen / max(len(direction), 1)))
+    if even > _NO_ROWS * across:
+        return (min(even, 2.5 * degree),) * 2
     cells = np.unique(np.stack([sector, np.floor(direction[:, 1] / across).astype(int)]), axis=1).shape[1]
     along = cells * 0.5 * degree / max(len(direction), 1)
     return across, float(np.clip(along, 0.08 * degree, degree))

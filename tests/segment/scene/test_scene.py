@@ -11,13 +11,14 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError
 from dpcli.prepare.synthetic.spinning_lidar import Lidar, scan
 from dpcli.prepare.synthetic.street_world import Mover, car, person, planar_pose, standing_street
 from dpcli.segment.scene.clusters import cluster
-from dpcli.segment.scene.ego_motion import register_frames
+from dpcli.segment.scene.ego_motion import OVERLAP, register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import LineOfSight, range_jumps
 from dpcli.segment.scene.report import _speed, picture_of_scene
@@ -377,6 +378,44 @@ def test_a_sensor_that_creeps_does_not_stand(way, rows):
     poses, overlap = register_frames(frames, [height_above_ground(frame) < 0.2 for frame in frames])
     assert np.linalg.norm(poses[1][:3, 3] - [way, 0, 0]) < 0.015 and overlap[0] > 0.5
     assert way or np.array_equal(poses[1], np.eye(4))
+
+
+def prisms(count, start):
+    """Returns the beams f64 (count,3) of a solid-state lidar: two turning prisms, whose curves differ from frame to frame."""
+    first, second = np.pi / 30 * np.array([[7294.0], [-4664.0]]) * (start + np.arange(0.5, count) / 240_000)
+    y, z = np.radians(17.5) * np.array([np.cos(first) + np.cos(second), np.sin(first) + np.sin(second)])
+    ahead = np.hypot(y, z)
+    return np.stack([np.cos(ahead), np.sinc(ahead / np.pi) * y, np.sinc(ahead / np.pi) * z], 1)
+
+
+def among_boxes(beams, x):
+    """Returns where beams (N,3) end that start 1.8 m above flat ground, x m along a street of boxes, and which are on the ground."""
+    rng, low = np.random.default_rng(1), np.where(beams[:, 2] < 0, -1.8 / beams[:, 2], np.inf)
+    reach = low
+    for i in range(24):  # houses with gaps between them, and cars before them
+        house, side = i % 2, (-1, 1)[i // 2 % 2]
+        place = np.array([6.0 + 4 * i + rng.uniform(-2, 2), side * (13 if house else 5.5), 5 * house + 0.7])
+        middle = place - [x, 0, 1.8]
+        half = np.array([3, 3, 5.7]) if house else np.array([2.2, 0.9, 0.7])
+        a, b = (middle - half) / beams, (middle + half) / beams
+        enter, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+        reach = np.where((enter < leave) & (enter > 0), np.minimum(reach, enter), reach)
+    far = reach > 80
+    ends = (reach + rng.normal(0, 0.015, len(beams)))[~far, None] * beams[~far]
+    return ends, (reach == low)[~far]
+
+
+def test_beams_that_never_repeat_show_the_motion_of_a_solid_state_lidar():
+    frames, ground = zip(*(among_boxes(prisms(24_000, 0.1 * t), 0.8 * t) for t in range(2)))
+    poses, overlap = register_frames(list(frames), list(ground))
+    assert np.linalg.norm(poses[1][:3, 3] - [0.8, 0, 0]) < 0.2 and overlap[0] > OVERLAP
+
+
+def test_curves_of_beams_are_no_dense_rows():
+    """Along the curves beams are 0.05 degrees apart; the median distance of another frame's beams is an upper bound."""
+    first, second = prisms(24_000, 0.0), prisms(24_000, 0.1)
+    seen, away = LineOfSight(10 * first, np.zeros(3)), np.median(cKDTree(first).query(second)[0])
+    assert np.radians(0.2) < seen.across == seen.along < away
 
 
 def test_a_frame_of_an_unknown_sensor_contradicts_what_is_farther_than_twice_the_tolerance():
