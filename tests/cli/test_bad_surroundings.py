@@ -133,21 +133,24 @@ def test_a_full_disk_below_the_pipe(raw, tmp_path, mounting):
 
 def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(tmp_path, mounting):
     """Mapped files get their room when they are made: a page without room, later, would end the process by SIGBUS."""
-    code = (
-        "import os; from pathlib import Path; from dpcli.errors import DpcError; from dpcli.segment.training.flow_store import FlowStore\n"
-        "try: store = FlowStore(Path(os.environ['D']), 40, 2048, fresh=True)\n"
-        "except DpcError as error: print(error)\n"
-        "else: store._first[:] = store._now[:] = 1; print('written')\n"
-    )
-    script = 'mount -t tmpfs -o size={} none "$D"; "$PYTHON" -c "$CODE"; echo "code $?"'
-    env = {"D": str(tmp_path), "CODE": code, "PYTHON": sys.executable}
-    for size, said in (
-        ("1m", "flows_first.npy: no space left"),
-        ("3m", "flows.npy: no space left on the device (about 2.0 MB needed, "),
-        ("9m", "written"),
-    ):
-        done = namespace(script.format(size), **env)  # two files of 1.9 MiB
-        assert said in done.stdout and done.stdout.endswith("code 0\n"), done.stdout + done.stderr
+    code = """
+import os, sys
+from pathlib import Path
+from dpcli.errors import DpcError
+from dpcli.segment.training.flow_store import FlowStore
+for size in sys.argv[1:]:
+    assert os.system(f'mount -t tmpfs -o size={size} none "$D"') == 0
+    try:
+        store = FlowStore(Path(os.environ["D"]), 40, 2048, fresh=True)  # two files of 1.9 MiB
+        store._first[:] = store._now[:] = 1
+        print("written")
+    except DpcError as error:
+        print(error)
+"""
+    done = namespace('"$PYTHON" -c "$CODE" 1m 3m 9m', D=str(tmp_path), CODE=code, PYTHON=sys.executable)
+    told = done.stdout.splitlines()
+    assert len(told) == 3 and "flows_first.npy: no space left" in told[0] and told[2] == "written", done
+    assert "flows.npy: no space left on the device (about 2.0 MB needed, " in told[1]
 
 
 def test_flows_have_their_room_on_the_disk_from_the_start(tmp_path):
