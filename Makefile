@@ -63,7 +63,7 @@ $(READY): pyproject.toml constraints.txt
 	    || { echo "make: $(PYTHON) lacks the venv module; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[test]'
-	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true # as pip does, on all cores; a few files are templates
+	$(BIN)/python -m compileall -qq -j 0 -x 'site-packages/.*/tests?/' $(VENV)/lib || true # as pip does, on all cores; a few files are templates
 	@touch $@
 
 demo: $(READY)
