@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -91,11 +92,20 @@ class _Bytes:
                 last = time.monotonic()
             elif time.monotonic() - last >= self.follow:
                 self.ended = True
-            else:
+            elif not self._begins_anew():
                 time.sleep(_POLL)
         self.position += count - missing
         self._frame.append(b"".join(pieces))
         return self._frame[-1]
+
+    def _begins_anew(self) -> bool:
+        """Goes to the start of a file that became shorter than what was read of it; returns whether it did."""
+        facts = os.fstat(self.descriptor)
+        if not stat.S_ISREG(facts.st_mode) or facts.st_size >= os.lseek(self.descriptor, 0, os.SEEK_CUR):
+            return False
+        log.warn("the file that is followed became shorter, as its writer began it anew; it is read from its start")
+        os.lseek(self.descriptor, 0, os.SEEK_SET)
+        return True
 
     def back_to_next(self, least: int) -> int:
         """Goes back to where another frame begins within this one, whose writer stopped in it and came back; returns how many of its

@@ -314,6 +314,22 @@ def test_a_growing_file_is_followed(tmp_path):
     assert len(got) == 6 and all(np.array_equal(mine, theirs) for mine, theirs in zip(got, frames))
 
 
+@pytest.mark.parametrize("half", [0, 60, 200])
+def test_a_file_that_its_writer_begins_anew_is_read_from_its_start(tmp_path, capsys, monkeypatch, half):
+    """As a camera program that is started again and opens its file for writing; the reader waited behind its end."""
+    path, frames = tmp_path / "s.npy", random_frames(4)
+    path.write_bytes(as_stream(frames[:2]) + as_stream(frames[2:3])[:half])
+    stream = open_frames(str(path), 0.3, cloud_files())
+    got = [next(stream), next(stream)]
+    monkeypatch.setattr(stream_input.time, "sleep", lambda _: path.write_bytes(as_stream(frames[3:])))
+    got.append(next(stream))
+    monkeypatch.undo()
+    stream.close()
+    assert all(np.array_equal(mine, theirs) for mine, theirs in zip(got, frames[:2] + frames[3:]))
+    said = capsys.readouterr().err
+    assert "began it anew" in said and ("cut off after" in said) == bool(half)
+
+
 def test_a_folder_is_followed_in_order_of_names_and_half_a_file_is_waited_for(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(stream_input, "_SETTLED", 0.4)  # the writer below may be slow on a busy machine
     for number in (2, 10, 9):
