@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -194,13 +195,13 @@ def snapped(replicate: np.ndarray, estimate: float) -> np.ndarray:
 
 def _bca_shares(estimate: float, replicate: np.ndarray, shares: np.ndarray, jackknife: np.ndarray | None) -> np.ndarray:
     """Returns the percentiles to take instead of `shares`: the same where all replicates lie on one side of the estimate."""
-    from scipy.special import ndtr, ndtri
-
     below = float(((replicate < estimate).mean() + (replicate <= estimate).mean()) / 2)
     if not 0 < below < 1:
         return shares
-    bias, quantiles = ndtri(below), ndtri(shares)
-    return ndtr(bias + (bias + quantiles) / (1 - _acceleration(jackknife) * (bias + quantiles)))
+    normal = NormalDist()  # scipy.special takes a quarter of a small evaluation to load
+    bias, quantiles = normal.inv_cdf(below), np.array([normal.inv_cdf(share) for share in shares])
+    moved = bias + (bias + quantiles) / (1 - _acceleration(jackknife) * (bias + quantiles))
+    return np.array([normal.cdf(quantile) for quantile in moved])
 
 
 def _acceleration(jackknife: np.ndarray | None) -> float:
