@@ -416,3 +416,15 @@ def test_a_body_that_some_frame_does_not_show_keeps_its_points_in_the_others():
     field = np.float32(np.where(np.eye(2)[label] > 0, 0.0, 0.4))
     masks = masks_of(Explanation([None, None], label, 0.0, field, field), [4, 4], 5)
     assert (masks.argmax(1) == label).all() and np.allclose(masks.sum(1), 1)
+
+
+@pytest.mark.parametrize(("turn", "told"), [(0.9, True), (0.0, False)])
+def test_motion_that_only_distant_frames_show_is_told(turn, told, capsys):
+    """A lid that opens in 40 frames, by a fraction of the distance between points from one to the next."""
+    rng, frames = np.random.default_rng(0), []
+    for angle in np.linspace(0, turn, 40):
+        base, lid = rng.uniform([-0.5, -0.3], [0, 0.3], (60, 2)), rng.uniform([0, -0.3], [0.5, 0.3], (60, 2))
+        raised = np.stack([lid[:, 0] * np.cos(angle), lid[:, 1], lid[:, 0] * np.sin(angle)], 1)
+        frames.append(torch.from_numpy(np.float32(np.concatenate([np.pad(base, ((0, 0), (0, 1))), raised]))))
+    MultibodySegmenter(MultibodySettings(max_bodies=1)).explain(frames, [])
+    assert ("--stride 5" in capsys.readouterr().err) == told
