@@ -18,8 +18,6 @@ def main() -> None:
     import gc
     import sys
 
-    gc.set_threshold(20_000)  # 700 objects, the default, come with each of the modules that libraries load
-
     try:
         from dpcli.interpreter import settle_interpreter
         from dpcli.standard_streams import hush_warnings, quiet_libraries, ready_streams

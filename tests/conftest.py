@@ -22,7 +22,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell's background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as under nohup: these tests go on, what they start hears it
     signal.signal(signal.SIGHUP, lambda number, frame: None)
-gc.set_threshold(20_000)  # as `dpc` itself does: libraries and thousands of tests are no garbage to look for
 if "PYTEST_XDIST_WORKER" in os.environ:  # the workers take the cores: more threads in each would wait for one another
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -30,7 +29,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # the workers take the cores: more thre
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Runs the kernels' own tests first: each kernel is compiled once, and then lies on disk for all workers."""
     items.sort(key=lambda item: "ops" not in item.path.parts)
-    gc.freeze()
+    gc.freeze()  # thousands of tests and their libraries are no garbage to look for
 
 
 @pytest.fixture(scope="session")
