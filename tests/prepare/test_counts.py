@@ -77,7 +77,6 @@ CLOUDS = {
 
 
 def shape_of(path):
-    load_shape.cache_clear()
     return load_shape(path, "y").triangles
 
 
