@@ -50,6 +50,12 @@ class Frames:
         seen.depth_maps = [DepthMap.of(surface.points, camera, self.spacing) for surface in self.surfaces]
         return seen
 
+    def apart(self, stride: int) -> Frames:
+        """Returns the same frames, each compared with those that lie multiples of `stride` apart."""
+        others = copy(self)
+        others.partners = np.array([choose_partners(t, len(self), stride) for t in range(len(self))])
+        return others
+
     def slice(self, t: int) -> slice:
         """Returns where the points of frame t lie among all N."""
         return slice(int(self.starts[t]), int(self.starts[t + 1]))
@@ -122,15 +128,16 @@ class Frames:
         return trajectory
 
 
-def choose_partners(t: int, frames: int) -> list[int]:
-    """Returns the frames that frame t is compared with: the nearest, then those twice as far, and so on.
+def choose_partners(t: int, frames: int, stride: int = 1) -> list[int]:
+    """Returns the frames that frame t is compared with: the nearest, then those twice as far, and so on, in steps of `stride`.
 
-    >>> choose_partners(0, 4), choose_partners(10, 32)
-    ([1, 2, 3], [9, 11, 8, 12, 6, 14])
+    >>> choose_partners(0, 4), choose_partners(10, 32), choose_partners(10, 32, 4)
+    ([1, 2, 3], [9, 11, 8, 12, 6, 14], [6, 14, 2, 18, 26, 22])
     """
-    wanted = min(_PARTNERS, frames - 1)
-    others = sorted((u for u in range(frames) if u != t), key=lambda u: abs(u - t))
-    sparse = [u for u in others if abs(u - t) & (abs(u - t) - 1) == 0]  # powers of two
+    wanted = min(_PARTNERS, (frames - 1) // stride)
+    others = sorted((u for u in range(t % stride, frames, stride) if u != t), key=lambda u: abs(u - t))
+    steps = {u: abs(u - t) // stride for u in others}
+    sparse = [u for u in others if steps[u] & (steps[u] - 1) == 0]  # powers of two
     return [*sparse, *(u for u in others if u not in sparse)][:wanted]
 
 

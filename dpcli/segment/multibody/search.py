@@ -8,9 +8,10 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from dpcli.segment.multibody.explanation import Body, Explanation, body_of, label_points, refit, without_empty
-from dpcli.segment.multibody.frames import Frames
+from dpcli.segment.multibody.frames import Frames, Trajectory
 from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
@@ -18,11 +19,16 @@ from dpcli.segment.multibody.point_fit import NUMBER_PRICE
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.splits import split_bodies
 from dpcli.segment.multibody.viewpoint import find_camera
+from dpcli.segment.rigid_motions import bring_to_rest
+from dpcli.segment.thinning import spread_places
 
 _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _SPLIT_GAIN = 1e-4  # of the energy, for which a round of splits is kept
 _SHOWN = 0.6  # share of the matches in other frames of a body's points that are its own points, at least
+SPANS = 7  # of a sequence, between whose ends motion is looked for that nearer frames don't show
+_WORSE = 0.02  # cost of a point between distant frames, more than between near ones, that shows such motion
+_TURNED = 0.5  # radians
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
@@ -48,8 +54,20 @@ def explain_sequence(
         if camera is not None:
             search = Search(frames.seen_by(camera), settings, hypotheses, pool.map)
             found = search.begin()
-        found = turn_least(search.frames, search.improve(found))
-        return search.judged_anew(simplify_motions(search.frames, found))
+        found = search.settled(search.improve(found))
+        stride = len(clouds) // SPANS
+        if stride < 2:
+            return found
+        far, known = search.between_distant(found, stride)
+        if _own_cost(known) < _own_cost(found) + _WORSE or (camera is not None and _shows_other_sides(known)):
+            return found
+        chosen = spread_places(len(clouds), SPANS + 1)
+        coarse = explain_sequence([clouds[t] for t in chosen], settings, origin, threads)
+        center = clouds[0].mean(0, dtype=np.float64)
+        slow = [fill_in(body.trajectory, chosen, len(clouds), center) for body in coarse.bodies]
+        far.pool += [*known.bodies, *(body_of(far.frames, trajectory) for trajectory in slow)]
+        better = far.settled(far.tighten(far.begin()))
+        return better if better.energy < known.energy else found
 
 
 def _least_price(frames: Frames) -> float:
@@ -58,6 +76,29 @@ def _least_price(frames: Frames) -> float:
     There one other frame judges every point, and many small bodies fit it by chance. More frames even that out.
     """
     return 6 * NUMBER_PRICE / len(frames.points)
+
+
+def fill_in(trajectory: Trajectory, known: np.ndarray, frames: int, center: np.ndarray) -> Trajectory:
+    """Returns a trajectory through all frames from one (M,3,4) through the frames `known` (M), the first and last among them.
+
+    In between, the body turns evenly and takes a point evenly along: the one that lies at `center` (3) in the first frame.
+    """
+    turns = Slerp(known, Rotation.from_matrix(trajectory[:, :, :3]))(np.arange(frames)).as_matrix()
+    rest = bring_to_rest(center, trajectory[0])
+    places = trajectory[:, :, :3] @ rest + trajectory[:, :, 3]
+    place = np.stack([np.interp(np.arange(frames), known, row) for row in places.T], 1)
+    return np.concatenate([turns, (place - turns @ rest)[:, :, None]], 2)
+
+
+def _shows_other_sides(found: Explanation) -> bool:
+    """Returns whether the largest body turns so far between frames that are compared that one camera sees other sides of it."""
+    traces = np.trace(found.bodies[0].motions[..., :3], axis1=-2, axis2=-1)
+    return bool(traces.min() < 1 + 2 * np.cos(_TURNED))
+
+
+def _own_cost(found: Explanation) -> float:
+    """Returns the mean cost of the points under their own bodies."""
+    return float(found.cost[np.arange(len(found.label)), found.label].mean())
 
 
 class Search:
@@ -80,7 +121,21 @@ class Search:
             if better is found:
                 break
             found = better
-        return self._tighten(self._split(found))
+        return self.tighten(self._split(found))
+
+    def settled(self, found: Explanation) -> Explanation:
+        """Returns the explanation with motions that turn least and are no more general than needed, judged anew."""
+        return self.judged_anew(simplify_motions(self.frames, turn_least(self.frames, found)))
+
+    def between_distant(self, found: Explanation, stride: int) -> tuple[Search, Explanation]:
+        """Returns a search of the explanation's bodies in which frames `stride` apart are compared, and its explanation by them.
+
+        Their motions are fitted anew, since what many near frames show together drifts.
+        """
+        far = Search(self.frames.apart(stride), self.settings, [], self.map)
+        bodies = [body_of(far.frames, body.trajectory) for body in found.bodies]
+        far.pool = bodies
+        return far, far.tighten(far._fitted(label_points(far.frames, bodies, self.settings, found.label)))
 
     def _split(self, found: Explanation) -> Explanation:
         """Returns the explanation after growth with motions of its bodies' patches, as long as the energy falls."""
@@ -180,7 +235,7 @@ class Search:
                 best = grown
         return best
 
-    def _tighten(self, found: Explanation) -> Explanation:
+    def tighten(self, found: Explanation) -> Explanation:
         """Returns the explanation with motions fitted ever tighter, onto the bodies' own points, where it costs less."""
         for own, tight in _FITS[1:]:
             fitted = refit(self.frames, found, self.settings, own, tight)

@@ -10,17 +10,14 @@ from torch import Tensor
 
 from dpcli.runtime.progress import log
 from dpcli.segment.multibody.explanation import Explanation
-from dpcli.segment.multibody.frames import Frames, relative_motion
+from dpcli.segment.multibody.frames import relative_motion
 from dpcli.segment.multibody.search import explain_sequence
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import follow_tracks, parts_of_tracks, undo_exchanges
 from dpcli.segment.segmenters import Segmenter
-from dpcli.segment.thinning import spread_places
 
 _TEMPERATURE = 0.2  # of masks, in costs of a point
 _EXCHANGES = 2  # times that exchanges of tracks are undone, since parts found without them show more of them
-_NEIGHBORS = 7  # frames up to which all are compared with one another
-_WORSE = 0.15  # cost of a point between distant frames, more than between near ones, that shows motion
 _LEAST_TRUST = 0.01  # of a body that some frame doesn't show: above 0, since the likeliest body of a mask is the part
 Motions = dict[tuple[int, int], tuple[Tensor, Tensor]]  # (t, u) -> motions (S,3,3), (S,3) of all parts
 
@@ -60,11 +57,6 @@ class MultibodySegmenter(Segmenter):
         if tracks is not None:
             return self._by_tracks([frame.numpy() for frame in frames], tracks, pairs, name)
         found = explain_sequence([frame.numpy() for frame in frames], self.settings, origin, threads)
-        if len(found.bodies) == 1 and len(frames) > _NEIGHBORS and _far_frames_differ(frames, found):
-            log.warn(
-                f"{name}: all is one part by frames near in time, but distant ones differ: parts that move slowly may be missed;"
-                f" keep fewer frames, such as by --stride {len(frames) // _NEIGHBORS} of dpc prepare (or other sides came into view)"
-            )
         sizes = [len(frame) for frame in frames]
         masks = list(torch.from_numpy(masks_of(found, sizes, self.slots)).split(sizes))
         return masks, {pair: self._motions(found, *pair) for pair in pairs}
@@ -99,13 +91,6 @@ class MultibodySegmenter(Segmenter):
         for k, body in enumerate(found.bodies):
             motion[k] = relative_motion(body.trajectory, t, u)
         return _as_tensors(motion)
-
-
-def _far_frames_differ(frames: list[Tensor], found: Explanation) -> bool:
-    """Returns whether the one body explains frames (N_t,3) far apart in time worse than those that its search compared."""
-    chosen = spread_places(len(frames), 4)
-    far = Frames([frames[t].numpy() for t in chosen]).explain(found.bodies[0].trajectory[chosen])[0]
-    return bool(far.mean() > found.bodies[0].cost.mean() + _WORSE)
 
 
 def _as_tensors(motion: np.ndarray) -> tuple[Tensor, Tensor]:

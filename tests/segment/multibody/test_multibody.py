@@ -7,13 +7,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from dpcli.segment.multibody.explanation import Explanation, body_of, label_points
 from dpcli.segment.multibody.frames import Frames, choose_partners, relative_motion
 from dpcli.segment.multibody.hypotheses import Hypothesis
 from dpcli.segment.multibody.joint_motions import simplify_motions
 from dpcli.segment.multibody.least_turn import turn_least
-from dpcli.segment.multibody.search import Search, explain_sequence
+from dpcli.segment.multibody.search import Search, explain_sequence, fill_in
 from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import follow_tracks, parts_of_tracks
@@ -418,13 +419,26 @@ def test_a_body_that_some_frame_does_not_show_keeps_its_points_in_the_others():
     assert (masks.argmax(1) == label).all() and np.allclose(masks.sum(1), 1)
 
 
-@pytest.mark.parametrize(("turn", "told"), [(0.9, True), (0.0, False)])
-def test_motion_that_only_distant_frames_show_is_told(turn, told, capsys):
+@pytest.mark.parametrize(("turn", "parts"), [(0.9, 2), (0.0, 1)])
+def test_motion_that_only_distant_frames_show_makes_parts(turn, parts):
     """A lid that opens in 40 frames, by a fraction of the distance between points from one to the next."""
-    rng, frames = np.random.default_rng(0), []
+    rng, clouds = np.random.default_rng(0), []
     for angle in np.linspace(0, turn, 40):
         base, lid = rng.uniform([-0.5, -0.3], [0, 0.3], (60, 2)), rng.uniform([0, -0.3], [0.5, 0.3], (60, 2))
         raised = np.stack([lid[:, 0] * np.cos(angle), lid[:, 1], lid[:, 0] * np.sin(angle)], 1)
-        frames.append(torch.from_numpy(np.float32(np.concatenate([np.pad(base, ((0, 0), (0, 1))), raised]))))
-    MultibodySegmenter(MultibodySettings(max_bodies=1)).explain(frames, [])
-    assert ("--stride 5" in capsys.readouterr().err) == told
+        clouds.append(np.float32(np.concatenate([np.pad(base, ((0, 0), (0, 1))), raised])))
+    found = explain_sequence(clouds, MultibodySettings(regrow=0))
+    assert len(found.bodies) == parts
+    lid = np.tile(np.repeat([False, True], 60), 40)
+    assert parts == 1 or (found.label == found.label[-1])[lid].mean() > 0.85
+
+
+def test_a_trajectory_is_filled_in_evenly():
+    turns = Rotation.from_rotvec(np.outer([0, 0.3, 0.9], [0, 0, 1])).as_matrix()
+    known = np.concatenate(
+        [turns, (np.array([5.0, 0, 0]) - turns @ [5.0, 0, 0])[..., None]], 2
+    )  # about a point at x = 5
+    filled = fill_in(known, np.array([0, 2, 4]), 5, np.array([5.0, 0, 0]))
+    assert np.allclose(filled[[0, 2, 4]], known)
+    assert np.allclose(Rotation.from_matrix(filled[:, :, :3]).magnitude(), [0, 0.15, 0.3, 0.6, 0.9])
+    assert np.allclose(filled[:, :, :3] @ [5.0, 0, 0] + filled[:, :, 3], [5, 0, 0])
