@@ -26,9 +26,9 @@ _TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _SPLIT_GAIN = 1e-4  # of the energy, for which a round of splits is kept
 _SHOWN = 0.6  # share of the matches in other frames of a body's points that are its own points, at least
-SPANS = 7  # of a sequence, between whose ends motion is looked for that nearer frames don't show
+_SPANS = 7  # of a sequence, between whose ends motion is looked for that nearer frames don't show
 _WORSE = 0.02  # cost of a point between distant frames, more than between near ones, that shows such motion
-_TURNED = 0.5  # radians
+_TURNED = 0.5  # radians by which a body turns that shows one camera other sides
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
@@ -55,19 +55,30 @@ def explain_sequence(
             search = Search(frames.seen_by(camera), settings, hypotheses, pool.map)
             found = search.begin()
         found = search.settled(search.improve(found))
-        stride = len(clouds) // SPANS
-        if stride < 2:
-            return found
-        far, known = search.between_distant(found, stride)
-        if _own_cost(known) < _own_cost(found) + _WORSE or (camera is not None and _shows_other_sides(known)):
-            return found
-        chosen = spread_places(len(clouds), SPANS + 1)
-        coarse = explain_sequence([clouds[t] for t in chosen], settings, origin, threads)
-        center = clouds[0].mean(0, dtype=np.float64)
-        slow = [fill_in(body.trajectory, chosen, len(clouds), center) for body in coarse.bodies]
-        far.pool += [*known.bodies, *(body_of(far.frames, trajectory) for trajectory in slow)]
-        better = far.settled(far.tighten(far.begin()))
-        return better if better.energy < known.energy else found
+        return _by_distant_frames(
+            search, found, lambda chosen: explain_sequence([clouds[t] for t in chosen], settings, origin, threads)
+        )
+
+
+def _by_distant_frames(search: Search, found: Explanation, explain: Callable[[np.ndarray], Explanation]) -> Explanation:
+    """Returns the explanation, or a better one where distant frames show motion too slow for those that were compared.
+
+    explain: explains some frames alone. A few spread over the sequence then propose bodies, which are tried beside those found.
+    """
+    count = len(search.frames)
+    stride = count // _SPANS
+    if stride < 2:
+        return found
+    far, known = search.between_distant(found, stride)
+    one_camera = search.frames.depth_maps is not None
+    if _own_cost(known) < _own_cost(found) + _WORSE or (one_camera and _shows_other_sides(known)):
+        return found
+    chosen = spread_places(count, _SPANS + 1)
+    center = search.frames.points[search.frames.slice(0)].mean(0)
+    slow = [fill_in(body.trajectory, chosen, count, center) for body in explain(chosen).bodies]
+    far.pool += [*known.bodies, *(body_of(far.frames, trajectory) for trajectory in slow)]
+    better = far.settled(far.tighten(far.begin()))
+    return better if better.energy < known.energy else found
 
 
 def _least_price(frames: Frames) -> float:
